@@ -273,7 +273,7 @@ class RemoteFolder:
 
 
 def _track_progress(names: Iterable[str]) -> Iterator[str]:
-    from drivesem.report.tables import Console, progress_bar
+    from drivesem.reporting.tables import Console, progress_bar
 
     names = list(names)
     with progress_bar(Console(stderr=True), keep=False, hidden=not names) as progress:

@@ -33,7 +33,7 @@ import yaml
 from trimesh.remesh import subdivide_to_size
 from trimesh.visual.material import SimpleMaterial
 
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.synth.render import rasterise
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError

@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from drivesem.report.tables import Console, format_count, progress_bar
+from drivesem.reporting.tables import Console, format_count, progress_bar
 from scene_ir import files
 from tools.same import Hasher, command_words, differences, environment
 from tools.small_frames import small_frames

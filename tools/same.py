@@ -41,7 +41,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 import drivesem
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 
 VARYING = {"seconds", "seconds_now", "versions", "images_a_second", "processor_seconds_an_image", "stamp"}
 """Keys of JSON and columns of CSV that differ from run to run."""

@@ -18,7 +18,7 @@ import numpy as np
 from detectors.registry import load_detector
 from drivesem.attacks.labels import Difficulty
 from drivesem.data.registry import open_dataset
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.training.frames import FrameStore
 from drivesem.training.validation import detect_in_store, score_detections
 

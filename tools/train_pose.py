@@ -27,7 +27,7 @@ from detectors.boxes import iou_matrix
 from detectors.registry import load_detector
 from detectors.types import CLASSES
 from drivesem.data.kitti import KittiDataset
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.scenes.label_free import POSE_ROUNDS
 from scene_ir import files
 from scene_ir.derender import pose

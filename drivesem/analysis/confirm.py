@@ -28,8 +28,8 @@ from drivesem.evaluation.resampling import wilson
 from drivesem.failures.grades import AGREEMENT_RULE, Grade, SecondOpinion
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.drawing import MARGIN_PX, PAPER_COLOUR, TEXT_PX, measure_text, paste, write_text
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent
+from drivesem.reporting.drawing import MARGIN_PX, PAPER_COLOUR, TEXT_PX, measure_text, paste, write_text
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count, format_percent
 from drivesem.run.attack import build_grader
 from drivesem.run.detection_cache import detect_objects, image_to_tensor
 from drivesem.run.driver import FrameAnalyser, ProgressSettings, analyse_frames

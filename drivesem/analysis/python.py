@@ -27,7 +27,7 @@ from drivesem.config.commands import (
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.config.options import CommandConfig
-from drivesem.report.tables import AnalysisReport
+from drivesem.reporting.tables import AnalysisReport
 from drivesem.run.finished import AttackRun
 
 Run: TypeAlias = "AttackRun | str | Path"

@@ -33,8 +33,8 @@ from drivesem.evaluation.resampling import (
     ratio_metric,
 )
 from drivesem.failures.grades import Grade
-from drivesem.report.plots import PLOT_STYLE, write_figure
-from drivesem.report.tables import AnalysisReport, ReportTable, format_percent
+from drivesem.reporting.plots import PLOT_STYLE, write_figure
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_percent
 from drivesem.run.detection_cache import DetectionCache, DetectorSpec, cache_detections
 from drivesem.run.finished import PICTURES, AttackRun, RunFrame, load_runs
 from drivesem.run.folder import claim_folder

@@ -235,6 +235,8 @@ IDENTITY_DB = 0.1
 _EXACT_DB = 120.0
 """A re-render with at least this PSNR, or none, is the photograph."""
 _NO_FILE = "no file"
+FIDELITY = 0.02
+"""Tolerance of the fidelity of a picture."""
 DRAWS = 1
 """Tolerance of a certificate in draws, as some scores lie close to t*."""
 _DETECTIONS = {
@@ -431,6 +433,9 @@ def _check_grades(
         expected, counted = _count_contrary_draws(recorded), _count_contrary_draws(failure)
         near = all(abs(a - b) <= DRAWS for a, b in zip(expected, counted, strict=True))
         log.record("grades", f"failures[{i}].count", expected, counted, agrees=near)
+        score, again_score = (1.0 if one.fidelity is None else one.fidelity.score for one in (recorded, failure))
+        same = abs(score - again_score) <= FIDELITY
+        log.record("grades", f"failures[{i}].fidelity", score, again_score, agrees=same)
         log.compare(
             "grades",
             f"failures[{i}].grade",
@@ -447,7 +452,7 @@ def _count_contrary_draws(failure: Failure) -> tuple[int, int]:
 
 def _grade_from_evidence(failure: Failure, rule: CertificateRule) -> Grade:
     """Return the grade that follows from the recorded draws and second opinions."""
-    if failure.count is None or not rule.holds(failure.count):
+    if failure.count is None or not rule.holds(failure.count) or not failure.is_trusted:
         return Grade.THRESHOLD
     if failure.second is None or not failure.second.agrees:
         return Grade.CERTAIN

@@ -18,7 +18,7 @@ from drivesem.bench import session as tables
 from drivesem.bench.timing import machine_facts, package_versions
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import Console, format_count
+from drivesem.reporting.tables import Console, format_count
 from scene_ir import files
 from scene_ir.errors import FormatError
 

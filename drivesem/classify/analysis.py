@@ -18,7 +18,7 @@ from drivesem.classify.results import SCHEMA, ClassifiedPicture
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.driver import CachedFrameResult, FrameAnalyser, ProgressSettings, analyse_frames
 from drivesem.run.folder import CONFIG, FRAMES, PRESENTATION, check_referenced_files, claim_folder
 from drivesem.run.labels import RESULT

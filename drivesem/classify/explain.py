@@ -16,7 +16,7 @@ from drivesem.analysis.explain.attribution import MinimalChangeSearch, ThetaBloc
 from drivesem.classify.analysis import FailureAnalyser, analyse_failures
 from drivesem.classify.space import AXES, ClassifyParameter, ObjectSpace
 from drivesem.config.commands import ClassifyConfig
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from scene_ir import files
 from scene_ir.errors import RangeError
 from scene_ir.io import to_uint8

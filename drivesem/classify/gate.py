@@ -14,7 +14,7 @@ from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import DRAWS
 from drivesem.failures.grades import Grade
 from drivesem.failures.neighbourhood import NEAR_REACH
-from drivesem.report.tables import AnalysisReport
+from drivesem.reporting.tables import AnalysisReport
 
 _VERB = "wrong"
 _NOTE = (

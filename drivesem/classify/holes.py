@@ -23,7 +23,7 @@ from drivesem.classify.scenes import SEEN_PX, VIEWS
 from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import wilson
 from drivesem.failures.rules import Floats, Intervals, fit_rule, rates_differ
-from drivesem.report.tables import AnalysisReport, ReportTable
+from drivesem.reporting.tables import AnalysisReport, ReportTable
 from scene_ir.io import round_to_8bit
 
 AXES: tuple[str, ...] = ("pitch", "yaw", "roll")

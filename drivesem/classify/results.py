@@ -11,9 +11,9 @@ from drivesem.classify.objective import attacked_parameters
 from drivesem.classify.pictures import ObjectView
 from drivesem.config.commands import ClassifyConfig
 from drivesem.failures.grades import Certificate, Grade, SecondOpinion
-from drivesem.report import web
-from drivesem.report.drawing import encode_jpeg_data_url
-from drivesem.report.tables import format_percent, rows_to_csv
+from drivesem.reporting import web
+from drivesem.reporting.drawing import encode_jpeg_data_url
+from drivesem.reporting.tables import format_percent, rows_to_csv
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import FRAMES
 from drivesem.run.labels import RESULT

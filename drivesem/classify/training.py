@@ -23,7 +23,7 @@ from drivesem.classify.objects.types import SPLITS
 from drivesem.classify.pictures import read_pictures, write_pictures
 from drivesem.config.commands import ClassifyConfig
 from drivesem.evaluation.resampling import wilson
-from drivesem.report.tables import Console, progress_bar, training_progress_bar
+from drivesem.reporting.tables import Console, progress_bar, training_progress_bar
 from drivesem.run.folder import PRESENTATION, claim_folder, resolve_output_folder
 from scene_ir import files
 

@@ -18,7 +18,7 @@ from drivesem.config.commands import (
     VerifyConfig,
 )
 from drivesem.config.devices import check_device
-from drivesem.report.tables import Console, ReportTable, format_count, print_json
+from drivesem.reporting.tables import Console, ReportTable, format_count, print_json
 from drivesem.run.driver import print_output_folder, publish_report
 
 

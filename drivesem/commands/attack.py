@@ -9,7 +9,7 @@ from rich.table import Table
 from drivesem.config.commands import AttackConfig, ReportConfig
 from drivesem.evaluation.coco import SCORE_TITLES
 from drivesem.failures.grades import Grade, Kind
-from drivesem.report.tables import Console, format_count, print_json
+from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.run.attack import attack_dataset
 from drivesem.run.folder import load_attack_config
 from drivesem.run.report.page import KINDS, NO_KIND, describe_frames, describe_objects

@@ -15,7 +15,7 @@ from drivesem.bench.session import BenchResult, BenchTable, run_benchmark, show_
 from drivesem.config.commands import BenchConfig
 from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import Console, format_count
+from drivesem.reporting.tables import Console, format_count
 from drivesem.run.attack import select_frames
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.scenes.sources import open_source

@@ -16,7 +16,7 @@ from detectors.registry import load_predictor
 from drivesem.config.commands import CheckConfig
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import Console, print_json
+from drivesem.reporting.tables import Console, print_json
 
 MIN_SIDE_PX = 64
 """Smallest side of a test picture: its blocks must be larger than a network's stride."""

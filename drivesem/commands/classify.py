@@ -16,7 +16,7 @@ from drivesem.classify.results import ClassCounts, ClassifyMetrics, format_accur
 from drivesem.classify.training import train_classifier
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.devices import check_device
-from drivesem.report.tables import Console, ReportTable, format_count, format_percent, print_json
+from drivesem.reporting.tables import Console, ReportTable, format_count, format_percent, print_json
 from drivesem.run.driver import print_output_folder, publish_report
 from drivesem.run.folder import claim_folder, resolve_output_folder
 from drivesem.run.run_report import PAGE

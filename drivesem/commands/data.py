@@ -18,8 +18,8 @@ from drivesem.data.account import DataAccount, write_account
 from drivesem.data.label_table import WriteSummary
 from drivesem.data.layouts import detect_layout
 from drivesem.data.subsets import FrameFilter, open_selection
-from drivesem.report.drawing import write_picture
-from drivesem.report.tables import Console, format_count, print_json
+from drivesem.reporting.drawing import write_picture
+from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.run.conversion import ConversionSettings, convert_labels
 from drivesem.run.labels import detect_labels_layout
 from drivesem.store import local_copy

@@ -18,7 +18,7 @@ from rich.text import Text
 
 import drivesem
 from drivesem.config.commands import DoctorConfig
-from drivesem.report.tables import Console, print_json, progress_bar
+from drivesem.reporting.tables import Console, print_json, progress_bar
 
 _COLOURS = {"works": "green", "missing": "yellow", "broken": "red"}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drivesem.analysis.evaluate.files import evaluate_files
 from drivesem.analysis.evaluate.report import print_evaluation
 from drivesem.config.commands import EvalConfig
-from drivesem.report.tables import Console, print_json
+from drivesem.reporting.tables import Console, print_json
 
 
 def eval_command(config: EvalConfig) -> int:

@@ -13,7 +13,7 @@ from drivesem.commands.attack import summarise_grades
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig, RunsConfig
 from drivesem.config.errors import UsageError
 from drivesem.failures.grades import Grade
-from drivesem.report.tables import Console, format_count, print_json
+from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.run.attack import merge_runs
 from drivesem.run.finished import METRICS
 from drivesem.run.folder import CONFIG, FRAMES, PLAN, is_attack_run, load_attack_config, result_settings

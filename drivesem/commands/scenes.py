@@ -13,7 +13,7 @@ from drivesem.config.commands import DerenderConfig, EditConfig, RenderConfig
 from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting, read_frame_edit
 from drivesem.config.errors import UsageError
 from drivesem.data.account import write_account
-from drivesem.report.tables import Console, format_count, print_json
+from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.scenes.scene import Scene, check_scene_folder
 from drivesem.scenes.sources import PhotographSource, SceneSource
 from scene_ir import files

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drivesem.config.commands import SynthConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import Console, format_count, print_json, progress_bar
+from drivesem.reporting.tables import Console, format_count, print_json, progress_bar
 from drivesem.run.folder import resolve_output_folder
 from drivesem.run.lock import acquire_folder_lock
 from drivesem.run.workers import make_parallel_map
@@ -91,7 +91,7 @@ def _write_mesh_notes(order: Order) -> None:
 def _sheet(order: Order) -> Path:
     """Write a contact sheet of the frames, as the layout's reader reads them."""
     from drivesem.data.registry import open_dataset
-    from drivesem.report.drawing import write_picture
+    from drivesem.reporting.drawing import write_picture
     from drivesem.synth.sheet import draw_sheet
 
     dataset = open_dataset(order.layout, order.out)

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from drivesem.config.commands import RetrainConfig, TrainConfig
 from drivesem.config.devices import check_device
-from drivesem.report.tables import Console, format_count, format_percent, print_json
+from drivesem.reporting.tables import Console, format_count, format_percent, print_json
 from drivesem.training.retrain import NOTE, RetrainRow, build_verdict_table, retrain_detector
 from drivesem.training.train import fit_dataset_anchors, run_training
 

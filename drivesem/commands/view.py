@@ -7,7 +7,7 @@ import webbrowser
 
 from drivesem.config.commands import ViewConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import Console, format_count, print_json
+from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.viewer.server import HOST, Server, Viewer, ViewerFrames, open_viewer_frames
 
 _PORT = 8321

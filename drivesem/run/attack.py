@@ -53,7 +53,7 @@ from drivesem.failures.grading import Grader, make_reference_detector
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from drivesem.run.finished import MANIFEST, METRICS, AttackRun, build_manifest, hash_json, load_runs
 from drivesem.run.folder import FRAMES, PLAN, claim_folder, load_run_detector, load_trusted_config, result_settings

@@ -33,7 +33,7 @@ from drivesem.config.commands import AttackConfig
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.config.options import DEMO, SCENES
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.attack import (
     WRITTEN,
     AttackWorker,

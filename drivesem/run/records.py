@@ -13,7 +13,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from drivesem.report.tables import cells_to_csv
+from drivesem.reporting.tables import cells_to_csv
 from scene_ir import files
 from scene_ir.errors import FormatError
 

@@ -12,7 +12,7 @@ from drivesem.evaluation.coco import CocoScores
 from drivesem.evaluation.resampling import Proportion
 from drivesem.failures.fidelity import ObjectFidelity
 from drivesem.failures.grades import Certificate, SecondOpinion
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.records import dump_record, load_record
 from scene_ir.errors import FormatError
 

@@ -23,7 +23,7 @@ from drivesem.evaluation.curves import sampled_curve
 from drivesem.evaluation.matched_class import MatchedClass
 from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grades import Grade
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, load_attack_config
 from drivesem.run.frame import summarise_frames, targets_and_detections

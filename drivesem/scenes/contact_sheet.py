@@ -9,7 +9,7 @@ import numpy as np
 
 from drivesem.data.classes import CLASS_OF_TYPE, object_type
 from drivesem.data.subsets import DatasetSelection
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     IGNORED_COLOUR,
     LOST_COLOUR,
     MARGIN_PX,

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     MARGIN_PX,
     PAPER_COLOUR,
     TEXT_PX,
@@ -23,7 +23,7 @@ from drivesem.report.drawing import (
     write_picture,
     write_text,
 )
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from scene_ir.io import to_uint8
 from scene_ir.raster import verbs
 from scene_ir.render.compositor import Compositor

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import wasserstein_distance
 
 from drivesem.data.registry import Dataset
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from scene_ir.errors import FormatError
 from scene_ir.files import write_bytes
 from scene_ir.types import Labels

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivesem.data.registry import Dataset
 from drivesem.data.vkitti2 import COLOURS
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     FAR_M,
     MARGIN_PX,
     NEAR_M,

@@ -19,8 +19,8 @@ from detectors.base import Detector
 from detectors.registry import SHIPPED
 from drivesem.attacks.labels import Difficulty
 from drivesem.evaluation.coco import ClassScores, CocoScores
-from drivesem.report.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
-from drivesem.report.tables import Console
+from drivesem.reporting.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
+from drivesem.reporting.tables import Console
 from drivesem.training.frames import TRAINING_LIMITS
 from scene_ir import files
 

@@ -34,7 +34,7 @@ from drivesem.evaluation.resampling import (
     WeightedRecall,
     paired_differences,
 )
-from drivesem.report.tables import (
+from drivesem.reporting.tables import (
     Console,
     ReportTable,
     format_count,

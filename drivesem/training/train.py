@@ -29,7 +29,7 @@ from drivesem.config.options import format_command_line
 from drivesem.data.account import write_account
 from drivesem.data.registry import Dataset
 from drivesem.data.subsets import FrameFilter, open_selection
-from drivesem.report.tables import Console, training_progress_bar
+from drivesem.reporting.tables import Console, training_progress_bar
 from drivesem.run.folder import SHARING, claim_folder
 from drivesem.run.workers import make_parallel_map
 from drivesem.training import validation

@@ -13,7 +13,7 @@ from drivesem.config.devices import memory_gb
 from drivesem.config.errors import UsageError
 from drivesem.config.options import DEMO, WorkerOptions
 from drivesem.data.subsets import Clip, find_clips, select_clip
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.derender import RECORD
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.scenes.sources import compile_source_kernels, derender_settings

@@ -16,8 +16,8 @@ import numpy as np
 from markupsafe import Markup
 from rich import box
 
-from drivesem.report import web
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.reporting import web
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.folder import FRAMES
 from scene_ir import files
 from scene_ir.errors import WriteError

@@ -21,8 +21,8 @@ from drivesem.config.commands import AttackConfig, DriveConfig
 from drivesem.config.devices import check_device
 from drivesem.failures.certificate import CompositorRenderer
 from drivesem.failures.grades import Grade
-from drivesem.report.drawing import write_picture
-from drivesem.report.tables import AnalysisReport, Console, format_count, progress_bar
+from drivesem.reporting.drawing import write_picture
+from drivesem.reporting.tables import AnalysisReport, Console, format_count, progress_bar
 from drivesem.run import attack as attacks
 from drivesem.run.folder import FRAMES, PRESENTATION, claim_folder
 from drivesem.run.frame import EvaluatedScene, build_grading_input, detection_records, target_records

@@ -25,7 +25,7 @@ from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.attacks.space import Budget
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import failures
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.viewer.sliders import SceneSliders, State
 from scene_ir.io import load_scene, round_to_8bit, to_uint8
 from scene_ir.render.compositor import Compositor

@@ -30,7 +30,7 @@ from drivesem.attacks.space import Budget
 from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import ViewConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import CONFIG, load_run_detector, load_trusted_config
 from drivesem.run.results import FrameResult
@@ -53,7 +53,7 @@ _ASSETS = {
     "/": ("drivesem.viewer", "page.html", "text/html; charset=utf-8"),
     "/page.css": ("drivesem.viewer", "page.css", "text/css; charset=utf-8"),
     "/page.js": ("drivesem.viewer", "page.js", "text/javascript; charset=utf-8"),
-    "/report.css": ("drivesem.report", "style.css", "text/css; charset=utf-8"),
+    "/report.css": ("drivesem.reporting", "style.css", "text/css; charset=utf-8"),
 }
 _JSON, _JPEG, _PNG, _TEXT = "application/json", "image/jpeg", "image/png", "text/plain; charset=utf-8"
 _MAX_SCENES, _MAX_PAGES = 2, 64

@@ -59,7 +59,7 @@ _LOGIC = ("scene_ir.types", "scene_ir.geometry", "scene_ir.ffd", "scene_ir.error
 _LOGIC_LIBRARIES = ("torch", "numpy", "scipy")
 _SEARCH = tuple(f"drivesem.attacks.{name}" for name in ("theta", "space", "feasible", "methods"))
 _BELOW_FAILURES = ("attacks", "scenes", "data", "evaluation", "config", "store", "synth")
-_BELOW_RUN = ("attacks", "failures", "scenes", "data", "evaluation", "report", "config", "store")
+_BELOW_RUN = ("attacks", "failures", "scenes", "data", "evaluation", "reporting", "config", "store")
 _NOT_IN_REPORTS = ("torch", "kornia", "warp", "pyrender", "open3d", "detectors", "scene_ir.raster")
 RULES = (
     Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "PIL", "trimesh", "warp", "yaml")),
@@ -108,11 +108,11 @@ RULES = (
         ("scene_ir", "detectors", *(f"drivesem.{part}" for part in (*_BELOW_RUN, "run"))),
         None,
     ),
-    Rule("drivesem.report", ("scene_ir.errors", "scene_ir.files"), None, never=_NOT_IN_REPORTS),
+    Rule("drivesem.reporting", ("scene_ir.errors", "scene_ir.files"), None, never=_NOT_IN_REPORTS),
     Rule(
         "drivesem.run.report",
         (
-            "drivesem.report",
+            "drivesem.reporting",
             "drivesem.run.results",
             "drivesem.failures.grades",
             "scene_ir.errors",

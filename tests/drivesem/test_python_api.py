@@ -197,7 +197,7 @@ def test_detections_margins_and_gradients(scene: ds.Scene) -> None:
 
 @pytest.mark.parametrize("objective", ["objectness", lambda candidates, *_: -candidates.log_scores[:, 0].amax()])
 def test_gradients_are_central_differences(scene: ds.Scene, objective: Any) -> None:
-    state, step = scene.edit(weather="fog"), 1e-3
+    state, step = scene.edit(weather={"fog": 0.6}), 1e-3
     found = ds.gradient(state, "squeezedet", objective, params="weather,translate")
     assert found.pixels.shape == (3, 376, 1241)
     losses = [
@@ -206,7 +206,7 @@ def test_gradients_are_central_differences(scene: ds.Scene, objective: Any) -> N
         ).loss
         for fog in (0.6 + step, 0.6 - step)
     ]
-    assert found.theta["weather.fog"] == pytest.approx((losses[0] - losses[1]) / (2 * step), rel=0.05, abs=0.02)
+    assert found.theta["weather.fog"] == pytest.approx((losses[0] - losses[1]) / (2 * step), rel=0.05)
 
 
 def test_an_objective_of_ones_own(scene: ds.Scene, tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_an_objective_of_ones_own(scene: ds.Scene, tmp_path: Path) -> None:
         overlap = iou_matrix(targets.boxes_xyxy[:1], candidates.boxes_xyxy[:, 0])[0] > 0.5
         return -candidates.log_scores[overlap, 0].amax()
 
-    options = {"params": "color,weather", "steps": 3, "confirm": False, "draws": 8}
+    options = {"params": "color,weather", "steps": 3, "confirm": False}
     found = ds.attack(scene, "squeezedet", objective=hide_the_first, **options)
     assert len(calls) > 3
     assert max(found.result.loss_trace) > found.result.loss_trace[0]

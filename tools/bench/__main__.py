@@ -24,7 +24,7 @@ from drivesem.config.constraints import parse_integers
 from drivesem.config.errors import UsageError
 from drivesem.config.options import CommandConfig
 from drivesem.program import Program
-from drivesem.report.tables import Console, format_count
+from drivesem.reporting.tables import Console, format_count
 from drivesem.run.attack import select_frames
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from scene_ir.derender.derender import DerenderSettings

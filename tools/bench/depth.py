@@ -16,7 +16,7 @@ from torch import Tensor
 from drivesem.bench.session import Columns
 from drivesem.config.options import DEMO
 from drivesem.data.registry import open_dataset
-from drivesem.report.drawing import write_picture
+from drivesem.reporting.drawing import write_picture
 from drivesem.synth.frames import SynthSettings, generate_frame
 from scene_ir.derender import depth
 from scene_ir.derender import depth as maps

@@ -11,7 +11,7 @@ import numpy as np
 
 from drivesem.bench.session import Columns
 from drivesem.config.edits import FOLIAGE_CODES, FrameEdit
-from drivesem.report.drawing import write_picture
+from drivesem.reporting.drawing import write_picture
 from drivesem.synth import frames as generated
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, Plan, SynthSettings

@@ -30,7 +30,7 @@ from drivesem.bench.session import Columns
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.options import SceneOptions
 from drivesem.evaluation.resampling import wilson
-from drivesem.report.drawing import PAPER_COLOUR, TEXT_PX, measure_text, write_text
+from drivesem.reporting.drawing import PAPER_COLOUR, TEXT_PX, measure_text, write_text
 from drivesem.run.workers import run_jobs
 from drivesem.scenes.sources import SceneSource, open_source
 from scene_ir import files

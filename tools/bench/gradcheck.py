@@ -41,7 +41,7 @@ from drivesem.attacks.labels import Labeller
 from drivesem.attacks.space import COMBOS, PAPER_PARAMETERS, Parameter, ParameterSpace, StepSizes
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import Console, format_count, print_json
+from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.run.attack import select_frames
 from drivesem.run.driver import ProgressSettings, print_output_folder, run_frame_jobs
 from drivesem.scenes.sources import SceneSource, open_source

@@ -23,7 +23,7 @@ from detectors.base import Predictor
 from detectors.registry import load_predictor
 from drivesem.bench.session import Columns
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
-from drivesem.report.drawing import PAPER_COLOUR, write_text
+from drivesem.reporting.drawing import PAPER_COLOUR, write_text
 from drivesem.run.workers import run_jobs
 from scene_ir import files
 from scene_ir.render.compositor import Compositor

@@ -25,7 +25,7 @@ from drivesem.attacks.targets import resolve_t_star
 from drivesem.bench.session import Columns
 from drivesem.config.edits import FrameEdit
 from drivesem.failures.margins import object_margins
-from drivesem.report.drawing import write_picture
+from drivesem.reporting.drawing import write_picture
 from drivesem.synth import frames as generated
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, Plan, SynthFrame, SynthSettings, Truth

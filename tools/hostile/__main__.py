@@ -23,7 +23,7 @@ from typing import Any
 
 from rich.table import Table
 
-from drivesem.report.tables import Console, progress_bar
+from drivesem.reporting.tables import Console, progress_bar
 from tools.hostile.cases import FAMILIES, cases
 from tools.hostile.inputs import ValidInputs
 from tools.hostile.trial import CaseResult, HostileCase, error_lines, judge, notes, run

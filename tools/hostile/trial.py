@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from tools.compare_checkouts import ROOT
 from tools.hostile.inputs import MARK, ValidInputs
 from tools.same import environment

@@ -23,7 +23,7 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from PIL import Image
 
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from scene_ir import files
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,8 +11,8 @@ import numpy as np
 from drivesem.config.commands import EvalConfig
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.conditions import ConditionRow, DetectedObjects, group_frames, recall_by_condition
-from drivesem.report.plots import write_intervals
-from drivesem.report.tables import ReportTable, cells_to_csv, format_percent
+from drivesem.reporting.plots import write_intervals
+from drivesem.reporting.tables import ReportTable, cells_to_csv, format_percent
 from scene_ir import files
 
 CONDITION_COLUMNS = ("condition",)

@@ -36,7 +36,7 @@ from drivesem.evaluation.conditions import ConditionRow, DetectedObjects
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.matched_class import FrameMarks, MatchedClass
 from drivesem.evaluation.resampling import DRAWS, Interval
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     DETECTED_COLOUR,
     IGNORED_COLOUR,
     LOST_COLOUR,
@@ -45,7 +45,7 @@ from drivesem.report.drawing import (
     LabelLayout,
     TextLabel,
 )
-from drivesem.report.tables import Console, format_count, format_percent
+from drivesem.reporting.tables import Console, format_count, format_percent
 from drivesem.run.detection_cache import detect_objects
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.training.frames import adapt_limits, evaluation_targets

@@ -42,7 +42,7 @@ from drivesem.evaluation.resampling import (
     bootstrap_intervals,
     paired_differences,
 )
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.labels import detect_labels_layout, read_labels
 from drivesem.store import local_copy
 from scene_ir import files

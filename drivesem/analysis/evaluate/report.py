@@ -23,8 +23,8 @@ from drivesem.evaluation.curves import InterpolationRule, average_precision
 from drivesem.evaluation.instances import Booleans, GroundTruthTable
 from drivesem.evaluation.matching import CandidatePairs, MatchResult
 from drivesem.evaluation.resampling import Interval, PairedDifference
-from drivesem.report.plots import write_bars, write_curves
-from drivesem.report.tables import Console, ReportTable, cells_to_csv, format_count, format_percent
+from drivesem.reporting.plots import write_bars, write_curves
+from drivesem.reporting.tables import Console, ReportTable, cells_to_csv, format_count, format_percent
 from scene_ir import files
 
 DISTANCES_M = (0.0, 10.0, 20.0, 30.0, 50.0, np.inf)

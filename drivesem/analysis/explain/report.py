@@ -22,8 +22,8 @@ from drivesem.analysis.explain.attribution import (
     PartOutcome,
 )
 from drivesem.evaluation.resampling import Interval, NamedMetric, bootstrap_intervals, ratio_metric
-from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.reporting.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.report.page import format_grade, grade_rank, name_failure
 from drivesem.run.results import Failure
 

@@ -59,7 +59,7 @@ from drivesem.evaluation.resampling import DRAWS
 from drivesem.failures.grades import AGREEMENT_RULE, Grade
 from drivesem.failures.grading import Grader
 from drivesem.failures.kinds import Fault, find_same_fault
-from drivesem.report.tables import AnalysisReport, format_count
+from drivesem.reporting.tables import AnalysisReport, format_count
 from drivesem.run.attack import build_grader
 from drivesem.run.driver import FrameAnalyser, ProgressSettings, analyse_frames
 from drivesem.run.finished import AttackRun, ChangedState, RebuiltFrame, load_runs

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from drivesem.attacks.objective import Objective, RenderEvaluation
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     MARGIN_PX,
     PAPER_COLOUR,
     TEXT_COLOUR,

@@ -34,8 +34,8 @@ from drivesem.config.commands import HolesConfig
 from drivesem.failures.failure_probability import UnitCubePoint, estimate_failure_probability
 from drivesem.failures.neighbourhood import NEAR_REACH, Neighbourhood, ObjectSample, SceneSampler
 from drivesem.failures.rules import Floats, Intervals, contains
-from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
-from drivesem.report.tables import AnalysisReport, Console, ReportTable, format_count, progress_bar
+from drivesem.reporting.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
+from drivesem.reporting.tables import AnalysisReport, Console, ReportTable, format_count, progress_bar
 from drivesem.run.driver import FrameAnalyser, K, analyse_runs
 from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
 from drivesem.run.folder import (

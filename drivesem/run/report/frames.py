@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.report import page as grading
 from drivesem.run.report.page import ReportedRun
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult

@@ -13,8 +13,8 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from drivesem.failures.grades import Grade
-from drivesem.report import web
-from drivesem.report.tables import format_count
+from drivesem.reporting import web
+from drivesem.reporting.tables import format_count
 from drivesem.run.report import page as grading
 from drivesem.run.report.frames import CloseUp, FrameCard, build_cards, describe_outcome, format_size
 from drivesem.run.report.page import (

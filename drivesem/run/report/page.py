@@ -13,7 +13,7 @@ from pathlib import Path
 from markupsafe import Markup, escape
 
 from drivesem.failures.grades import AGREEMENT_RULE, Certificate, Grade, Kind, SecondOpinion, draw_verb
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 from drivesem.run.results import Failure, FrameResult, RunSummary
 
 SERIES = 7

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     DETECTED_COLOUR,
     IGNORED_COLOUR,
     LOST_COLOUR,

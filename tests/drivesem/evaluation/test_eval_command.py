@@ -12,7 +12,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from drivesem.cli import main
-from drivesem.report.drawing import LOST_COLOUR
+from drivesem.reporting.drawing import LOST_COLOUR
 from scene_ir import files
 
 Run = Callable[..., tuple[int, dict, str]]

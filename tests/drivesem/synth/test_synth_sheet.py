@@ -10,7 +10,7 @@ import pytest
 
 from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation
 from drivesem.data.registry import WRITERS, open_dataset
-from drivesem.report import drawing
+from drivesem.reporting import drawing
 from drivesem.synth import sheet as sheets
 from drivesem.synth.exposure import expose
 from drivesem.synth.frames import generate_frame

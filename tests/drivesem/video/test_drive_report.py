@@ -3,7 +3,7 @@
 import io
 from pathlib import Path
 
-from drivesem.report.tables import Console
+from drivesem.reporting.tables import Console
 from drivesem.video.report import STATES, CarResult, DriveResult, build_report, format_summary
 
 

@@ -19,8 +19,8 @@ from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
-from drivesem.report.plots import PLOT_COLOURS, PLOT_STYLE
-from drivesem.report.tables import AnalysisReport, ReportTable
+from drivesem.reporting.plots import PLOT_COLOURS, PLOT_STYLE
+from drivesem.reporting.tables import AnalysisReport, ReportTable
 from drivesem.scenes.sources import NoVehicleError, SceneSource, open_source
 from scene_ir import files
 from scene_ir.render.compositor import Compositor

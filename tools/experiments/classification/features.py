@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from drivesem.classify.networks.architectures import Classifier
 from drivesem.classify.training import compute_features
-from drivesem.report.tables import Console, training_progress_bar
+from drivesem.reporting.tables import Console, training_progress_bar
 from drivesem.run.detection_cache import weights_digest
 from scene_ir import files
 from tools.experiments.realism.comparison import Measures

@@ -25,7 +25,7 @@ from drivesem.classify.scenes import VIEWS, open_backgrounds
 from drivesem.classify.training import compute_features, train_last_layer
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
-from drivesem.report.tables import AnalysisReport
+from drivesem.reporting.tables import AnalysisReport
 from drivesem.run.folder import ARMS, FRAMES, PRESENTATION, RETRAINED, claim_folder, resolve_output_folder
 from scene_ir import files
 from tools.experiments.classification.arms import (

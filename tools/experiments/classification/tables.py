@@ -12,7 +12,7 @@ import numpy as np
 
 from drivesem.classify.objects.types import CLASSES, SPLITS
 from drivesem.evaluation.resampling import Interval
-from drivesem.report.tables import ReportTable
+from drivesem.reporting.tables import ReportTable
 from tools.experiments.classification.arms import (
     BENIGN,
     BENIGN_RETRAINED,

@@ -22,8 +22,8 @@ from drivesem.analysis.transfer import format_interval
 from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
 from drivesem.evaluation.resampling import Interval, NamedMetric, holm, paired_differences
-from drivesem.report.plots import PLOT_COLOURS
-from drivesem.report.tables import AnalysisReport, ReportTable, format_percent
+from drivesem.reporting.plots import PLOT_COLOURS
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_percent
 from drivesem.run.run_report import PAPER_BENIGN, PAPER_COMBOS, PROTOCOL
 from tools.experiments.detection.arms import PAPER_PROTOCOL, AttackArm, base_attack, bootstrap_draws
 from tools.experiments.detection.comparison import ArmMetrics, feasible_fraction

@@ -14,9 +14,9 @@ import numpy as np
 
 from drivesem.evaluation.resampling import Interval
 from drivesem.failures.grades import Grade
-from drivesem.report.drawing import MARGIN_PX, PAPER_COLOUR, TEXT_PX, paste, write_picture, write_text
-from drivesem.report.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
-from drivesem.report.tables import format_count
+from drivesem.reporting.drawing import MARGIN_PX, PAPER_COLOUR, TEXT_PX, paste, write_picture, write_text
+from drivesem.reporting.plots import LINE_STYLES, PLOT_COLOURS, PLOT_STYLE
+from drivesem.reporting.tables import format_count
 from drivesem.run.folder import ARMS, FRAMES
 from drivesem.run.results import FrameResult
 from drivesem.run.run_report import PAPER_BENIGN

@@ -13,7 +13,7 @@ from drivesem.attacks.targets import HEADLINE
 from drivesem.evaluation.resampling import Interval, PairedDifference
 from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grades import Grade, Kind
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count, format_percent
 from drivesem.run.run_report import PAPER_BENIGN
 from tools.experiments.detection.arms import PLACEBO, RANDOM, bootstrap_draws
 from tools.experiments.detection.comparison import (

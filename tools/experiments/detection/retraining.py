@@ -18,7 +18,7 @@ from drivesem.attacks.targets import HEADLINE, resolve_t_star
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.matched_class import ThresholdMatches
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.tables import Console
+from drivesem.reporting.tables import Console
 from drivesem.run.attack import AttackWorker, select_frames
 from drivesem.run.detection_cache import weights_digest
 from drivesem.run.finished import load_runs

@@ -20,7 +20,7 @@ from drivesem.config.options import DEMO
 from drivesem.data.registry import Dataset, open_dataset
 from drivesem.data.subsets import open_selection
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.tables import Console
+from drivesem.reporting.tables import Console
 from drivesem.run.attack import AttackWorker
 from drivesem.run.folder import ARMS, HELD_OUT, RETRAINED
 from drivesem.run.run_report import PAPER_BENIGN, PAPER_COMBOS, follows_paper

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from drivesem.analysis.transfer import AP50, BROKEN, LOST, format_interval
 from drivesem.attacks.targets import HEADLINE
 from drivesem.evaluation.resampling import Interval
-from drivesem.report.plots import PLOT_COLOURS
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count, format_percent
+from drivesem.reporting.plots import PLOT_COLOURS
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count, format_percent
 from tools.experiments.detection.arms import feasible_share
 from tools.experiments.detection.comparison import METRIC_NAMES, MODES
 from tools.experiments.detection.plots import bar_position, draw_bars, write_figure

@@ -10,7 +10,7 @@ from drivesem.analysis.confirm import Confirmation, run_confirm
 from drivesem.analysis.transfer import DETECTIONS
 from drivesem.config.commands import ConfirmConfig
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.report.tables import AnalysisReport, Console
+from drivesem.reporting.tables import AnalysisReport, Console
 from drivesem.run.folder import ARMS, PRESENTATION, RETRAINED, claim_folder, resolve_output_folder
 from drivesem.training.card import warn_about_overlaps
 from tools.experiments.detection.arms import STUDY_JSON, StudyArms, build_arms, build_workers, run_arms

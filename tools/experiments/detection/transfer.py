@@ -32,7 +32,7 @@ from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import DEFAULT_COMBO, AttackConfig
 from drivesem.config.options import DetectionOptions
 from drivesem.evaluation.resampling import Interval, paired_differences
-from drivesem.report.tables import AnalysisReport, ReportTable, format_percent
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_percent
 from drivesem.run.attack import AttackWorker
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import ARMS

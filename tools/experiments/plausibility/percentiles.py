@@ -20,7 +20,7 @@ from drivesem.attacks.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, RU
 from drivesem.attacks.space import behind_camera
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.finished import AttackRun, RunFrame, load_runs
 from drivesem.run.folder import FRAMES, resolve_output_folder
 from drivesem.run.results import FrameResult

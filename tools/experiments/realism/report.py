@@ -12,7 +12,7 @@ from rich.progress import track
 
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS
-from drivesem.report.tables import AnalysisReport, Console, ReportTable
+from drivesem.reporting.tables import AnalysisReport, Console, ReportTable
 from drivesem.run.finished import AttackRun, load_runs
 from drivesem.run.folder import resolve_output_folder
 from tools.experiments.realism.comparison import PAIRS, FrameRegions, RealismRow, measure_frame, realism_rows

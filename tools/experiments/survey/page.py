@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from detectors.types import CLASSES
-from drivesem.report import web
-from drivesem.report.drawing import encode_jpeg_data_url
-from drivesem.report.tables import Console, format_count, print_json
+from drivesem.reporting import web
+from drivesem.reporting.drawing import encode_jpeg_data_url
+from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.run.finished import AttackRun, RunFrame, load_runs
 from drivesem.run.folder import resolve_output_folder
 from drivesem.run.records import from_json

@@ -12,7 +12,7 @@ import numpy as np
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import DRAWS, Interval, NamedMetric, bootstrap_intervals
-from drivesem.report.tables import AnalysisReport, ReportTable, format_count
+from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.folder import resolve_output_folder
 from tools.experiments.settings import SurveyResultsConfig
 from tools.experiments.survey.page import KEY, KINDS, SurveyItem, SurveyResponse, read_answers, read_key

@@ -15,7 +15,7 @@ from rich.progress import track
 
 from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import DRAWS, Interval
-from drivesem.report.tables import AnalysisReport, Console, ReportTable
+from drivesem.reporting.tables import AnalysisReport, Console, ReportTable
 from drivesem.run.finished import AttackRun, load_runs
 from drivesem.run.folder import ARMS, CONFIG, HELD_OUT, RETRAINED, resolve_output_folder
 from drivesem.run.run_report import PAPER_FID, PAPER_LPIPS

@@ -18,7 +18,7 @@ from PIL import Image
 
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
-from drivesem.report.plots import PLOT_COLOURS
+from drivesem.reporting.plots import PLOT_COLOURS
 from drivesem.run.report.frames import build_cards
 from drivesem.run.results import load_frame
 from drivesem.run.run_report import PROTOCOL, load_reported_runs
@@ -206,7 +206,7 @@ def _contrast(a: str, b: str) -> float:
 
 def test_colours_are_distinguishable() -> None:
     """WCAG 2.1 AA: 4.5 for text, 3 for lines, where they are not yellow or light blue with a dash as well."""
-    style = resources.files("drivesem.report").joinpath("style.css").read_text(encoding="utf-8")
+    style = resources.files("drivesem.reporting").joinpath("style.css").read_text(encoding="utf-8")
     light, dark = (
         dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", part)) for part in re.findall(r":root {(.+?)}", style, re.S)
     )

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.report import tables
-from drivesem.report.tables import Console, ReportTable, format_count, progress_bar, rows_to_csv
+from drivesem.reporting import tables
+from drivesem.reporting.tables import Console, ReportTable, format_count, progress_bar, rows_to_csv
 
 COLUMNS = ("arm", "where", "PSNR, dB", "perceptual distance", "FID")
 ROWS = (

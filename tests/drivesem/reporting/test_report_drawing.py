@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.report.drawing import (
+from drivesem.reporting.drawing import (
     DETECTED_COLOUR,
     LOST_COLOUR,
     TEXT_PX,

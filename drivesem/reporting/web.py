@@ -10,14 +10,14 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from drivesem.report.tables import format_count
+from drivesem.reporting.tables import format_count
 
 
 def render_page(template: str, script: str | None = None, **values: Any) -> str:
     """Return the text of a page.
 
     Args:
-        template: `PACKAGE:FILE` of a template that extends `drivesem.report:base.html`; it may call
+        template: `PACKAGE:FILE` of a template that extends `drivesem.reporting:base.html`; it may call
             `format_count`.
         script: `PACKAGE:FILE` of the only script that the content security policy allows, by its hash.
         values: Variables of the template; they are escaped.
@@ -28,7 +28,7 @@ def render_page(template: str, script: str | None = None, **values: Any) -> str:
     source = None if script is None else _read_resource(script)
     return environment.get_template(template).render(
         format_count=format_count,
-        style=Markup(_read_resource("drivesem.report:style.css")),
+        style=Markup(_read_resource("drivesem.reporting:style.css")),
         script=None if source is None else Markup(source),
         script_hash=None if source is None else Markup(_hash_script(source)),
         **values,
