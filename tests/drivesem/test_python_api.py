@@ -133,7 +133,7 @@ def test_the_signature_is_the_commands() -> None:
 
 def test_examples_in_docstrings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("scenes.scene", "run.counterexample", "run.probes", "analysis.python"):
+    for name in ("scenes.scene", "run.counterexample", "run.probes", "commands.python"):
         module = importlib.import_module(f"drivesem.{name}")
         assert doctest.testmod(module, raise_on_error=True).attempted > 0
         assert "```pycon\n>>> import" in (module.__doc__ or "")  # else the site shows quotations
@@ -195,18 +195,22 @@ def test_detections_margins_and_gradients(scene: ds.Scene) -> None:
         ds.margin(scene, detector, 6)
 
 
-@pytest.mark.parametrize("objective", ["objectness", lambda candidates, *_: -candidates.log_scores[:, 0].amax()])
-def test_gradients_are_central_differences(scene: ds.Scene, objective: Any) -> None:
-    state, step = scene.edit(weather={"fog": 0.6}), 1e-3
+@pytest.mark.parametrize(
+    ("objective", "error"),
+    [
+        ("objectness", 0.25),  # the IoU that its targets depend on counts as constant
+        (lambda candidates, *_: -candidates.log_scores[:, 0].amax(), 0.05),
+    ],
+)
+def test_gradients_are_central_differences(scene: ds.Scene, objective: Any, error: float) -> None:
+    state, step = scene.edit(weather={"fog": 0.6}), 2e-4
     found = ds.gradient(state, "squeezedet", objective, params="weather,translate")
     assert found.pixels.shape == (3, 376, 1241)
-    losses = [
-        ds.gradient(
-            state.edit(weather={**state.weather, "fog": fog}), "squeezedet", objective, params="weather"
-        ).loss
-        for fog in (0.6 + step, 0.6 - step)
-    ]
-    assert found.theta["weather.fog"] == pytest.approx((losses[0] - losses[1]) / (2 * step), rel=0.05)
+    low, high = (
+        ds.gradient(scene.edit(weather={"fog": fog}), "squeezedet", objective, params="weather").loss
+        for fog in (0.6 - step, 0.6 + step)
+    )
+    assert found.theta["weather.fog"] == pytest.approx((high - low) / (2 * step), rel=error)
 
 
 def test_an_objective_of_ones_own(scene: ds.Scene, tmp_path: Path) -> None:
