@@ -119,8 +119,7 @@ class NetworkDetector(DenseDetector):
                 f"{where}: expected a network that takes an image of {size[0]} x {size[1]} px (set `size` and "
                 f"`input` in a YAML file), found {_last_line(error)}"
             ) from error
-        shapes = [tuple(output.shape) for output in outputs]
-        found = make_decoder(shapes, size, self._settings, names, where)
+        found = make_decoder(outputs, size, self._settings, names, where)
         spec = found.spec
         self._decoder = found
         self.classes = found.classes

@@ -1,14 +1,15 @@
 """ONNX files as detectors without a gradient, run by ONNX Runtime.
 
-The output format is recognised from the shapes (`detectors.adapters.formats`); the input follows from it, or from
-a YAML file (`detectors.adapters.spec`).
+The graph runs once: what its outputs measure gives their format (`detectors.adapters.formats`). The input follows
+from it, from what the graph declares, and from a YAML file (`detectors.adapters.spec`), which wins.
 """
 
 from __future__ import annotations
 
 import ast
+import importlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from detectors import boxes
-from detectors.adapters.formats import Shape, make_decoder
+from detectors.adapters.formats import OutputDecoder, make_decoder, select_names
 from detectors.adapters.spec import (
     MAX_SIDE,
     ImagePlacement,
@@ -27,6 +28,7 @@ from detectors.adapters.spec import (
     fit_images,
     load_settings,
     normalise_images,
+    validate_settings,
     with_project_names,
 )
 from detectors.base import DetectorError
@@ -46,8 +48,8 @@ class TileOutputs:
 
     tile: Tile
     """The tile."""
-    outputs: tuple[np.ndarray, ...]
-    """One array per output."""
+    outputs: tuple[Tensor, ...]
+    """One tensor per output."""
     placement: ImagePlacement
     """Where the tile lies in the network's input."""
 
@@ -79,17 +81,11 @@ class OnnxPredictor:
         """
         if tiling not in TILINGS:
             raise DetectorError(f"tiles: expected {' or '.join(TILINGS)}, found {tiling!r}")
-        session = open_session(path)
-        inputs = [(node.name, list(node.shape)) for node in session.get_inputs()]
-        shapes: list[Shape] = [tuple(output.shape) for output in session.get_outputs()]
-        names = _names(session.get_modelmeta().custom_metadata_map)
-        settings = load_settings(path, spec)
-        self.input_hw = _input_hw(path, inputs, settings.get("size"))
-        self._decoder = make_decoder(shapes, self.input_hw, settings, names, str(path))
-        flat_image = len(inputs[0][1]) == 3
-        self._spec: NetworkSpec = replace(
-            self._decoder.spec, size=self.input_hw, **({"input": "image"} if flat_image else {})
-        )
+        graph = OnnxGraph(path, spec)
+        self._graph = graph
+        self.input_hw = graph.input_hw
+        self._decoder = graph.decoder
+        self._spec = graph.decoder.spec
         self.format = self._decoder.format
         self.name = path.stem
         self.classes = self._decoder.classes
@@ -98,8 +94,6 @@ class OnnxPredictor:
         self._nms_iou = NMS_IOU if self._spec.nms_iou is None else self._spec.nms_iou
         self._least_score = LEAST_SCORE if self._spec.least_score is None else self._spec.least_score
         self._tiling = tiling
-        self._session = session
-        self._input = inputs[0][0]
 
     def forward(self, images: Tensor) -> OnnxPredictions:
         """images (B, 3, H, W), RGB in [0, 1]; no gradient."""
@@ -116,16 +110,12 @@ class OnnxPredictor:
     def _run_tile(self, image: Tensor, tile: Tile) -> TileOutputs:
         part = image[None, :, tile.y0 : tile.y1, tile.x0 : tile.x1].float().cpu()
         network_input, placement = fit_images(part, self._spec)
-        network_input = normalise_images(network_input, self._spec)
-        given = network_input if self._spec.input == "batch" else network_input[0]
-        outputs = self._session.run(None, {self._input: given.contiguous().numpy()})
-        return TileOutputs(tile, tuple(outputs), placement)
+        return TileOutputs(tile, tuple(self._graph.run(network_input, self._spec)), placement)
 
     def _merge(self, tiles: Sequence[TileOutputs], image_hw: tuple[int, int]) -> Detections:
         per_tile: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         for tile_outputs in tiles:
-            outputs = [torch.from_numpy(output) for output in tile_outputs.outputs]
-            (edges,), (all_scores,) = self._decoder.decode(outputs, self.input_hw)
+            (edges,), (all_scores,) = self._decoder.decode(tile_outputs.outputs, self.input_hw)
             cells, labels = (all_scores > self._least_score).nonzero(as_tuple=True)
             scores = all_scores[cells, labels]
             boxes_xyxy = _to_image(edges[cells], tile_outputs)
@@ -143,13 +133,114 @@ class OnnxPredictor:
         return Detections(boxes.clip(boxes_xyxy, *image_hw), labels, scores)
 
 
+_SIDE_INPUTS: dict[str, Callable[[tuple[int, int]], list[float]]] = {
+    "orig_target_sizes": lambda hw: [hw[1], hw[0]],
+    "im_shape": lambda hw: [*hw],
+    "scale_factor": lambda _: [1, 1],
+}
+"""Inputs of RT-DETR's and Paddle's graphs besides the image: numbers by the image's (height, width) in px. With these,
+boxes are px of the image that the graph gets.
+"""
+_TYPES = {
+    "tensor(float)": np.float32,
+    "tensor(double)": np.float64,
+    "tensor(float16)": np.float16,
+    "tensor(uint8)": np.uint8,
+    "tensor(int32)": np.int32,
+    "tensor(int64)": np.int64,
+}
+_MAX_BATCH = 64
+"""Largest fixed batch: copies of one image fill it."""
+_BFLOAT16 = "tensor(bfloat16)"
+_EIGHT_BIT: dict[str, Any] = {"scale": 255.0, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
+"""Settings of a graph that takes whole numbers: it normalises pixels by itself."""
+
+
+class OnnxGraph:
+    """An ONNX graph of one image, and how its outputs are decoded."""
+
+    session: Any
+    """ONNX Runtime's."""
+    input_hw: tuple[int, int]
+    """Size of the image that it takes, px."""
+    decoder: OutputDecoder
+    """Decodes its outputs; has the complete settings."""
+
+    def __init__(self, path: Path, spec: Path | None = None) -> None:
+        """Load a graph and run it once.
+
+        Args:
+            path: The ONNX file.
+            spec: YAML file of settings; by default FILE.yaml for FILE.onnx, if there is one.
+
+        Raises:
+            DetectorError: The file or ONNX Runtime is missing, the graph takes no image or cannot be run, or no format
+                fits.
+        """
+        self.session = session = open_session(path)
+        settings = load_settings(path, spec)
+        facts: Mapping[str, str] = session.get_modelmeta().custom_metadata_map
+        inputs = {node.name: node for node in session.get_inputs()}
+        others = [name for name in inputs if name in _SIDE_INPUTS]
+        images = {name: list(node.shape) for name, node in inputs.items() if name not in others}
+        size = settings.get("size") or _exported_size(facts)
+        self.input_hw, self._channels_last = _image_layout(path, images, size, "size" in settings)
+        ((self._image, shape),) = images.items()
+        self._is_batch = len(shape) == 4
+        self._batch = shape[0] if self._is_batch and isinstance(shape[0], int) else 1
+        self._type = _input_type(path, inputs[self._image])
+        self._others = {
+            name: np.asarray([_SIDE_INPUTS[name](self.input_hw)] * self._batch, _input_type(path, inputs[name]))
+            for name in others
+        }
+        outputs = {node.name: node.type for node in session.get_outputs()}
+        self._outputs = select_names(outputs)
+        self._is_bfloat16 = any(outputs[name] == _BFLOAT16 for name in self._outputs)
+        if not np.issubdtype(self._type, np.floating):
+            settings = _EIGHT_BIT | settings
+        self.decoder = self._measure(path, {**settings, "size": self.input_hw}, _names(facts), {*inputs, *outputs})
+
+    def run(self, network_input: Tensor, spec: NetworkSpec) -> list[Tensor]:
+        """The outputs for an image (1, 3, *input_hw), RGB in [0, 1], that fits the graph's size."""
+        image = normalise_images(network_input, spec)
+        image = image.permute(0, 2, 3, 1) if self._channels_last else image
+        given = image.expand(self._batch, -1, -1, -1).numpy() if self._is_batch else image[0].numpy()
+        if not np.issubdtype(self._type, np.floating):
+            given = np.clip(np.rint(given), 0, 255)
+        feeds = {self._image: np.ascontiguousarray(given, self._type), **self._others}
+        if self._is_bfloat16:  # numpy has no such type
+            values = {name: _runtime().OrtValue.ortvalue_from_numpy(array) for name, array in feeds.items()}
+            outputs = [torch.from_dlpack(v) for v in self.session.run_with_ort_values(self._outputs, values)]
+        else:
+            outputs = [torch.from_numpy(np.asarray(one)) for one in self.session.run(self._outputs, feeds)]
+        # copies of the image fill a batch of fixed size
+        return [one[:1] if self._batch > 1 and one.shape[:1] == (self._batch,) else one for one in outputs]
+
+    def _measure(
+        self, path: Path, settings: dict[str, Any], names: tuple[str, ...] | None, node_names: set[str]
+    ) -> OutputDecoder:
+        """Run the graph on a grey image, and settle how its outputs are decoded."""
+        grey = torch.full((1, 3, *self.input_hw), 0.5)
+        try:
+            outputs = self.run(grey, replace(NetworkSpec(), **settings))
+        except DetectorError:
+            raise
+        except Exception as error:  # ONNX Runtime's error classes differ between versions
+            expected = f"a graph that takes an image of {self.input_hw[0]} x {self.input_hw[1]} px"
+            raise DetectorError(f"{path}: expected {expected}, found {_first_line(error)}") from None
+        return make_decoder(outputs, self.input_hw, settings, names, str(path), node_names)
+
+
 def open_session(path: Path) -> Any:
     """The graph of an ONNX file, ready to run with as many threads as torch has now.
 
     Raises:
         DetectorError: The file or ONNX Runtime is missing, or the file is damaged.
     """
-    runtime = _runtime(path)
+    try:
+        runtime = _runtime()
+    except ImportError:
+        raise DetectorError(f"{path}: needs ONNX Runtime: pip install 'onnxruntime>=1.19'") from None
     if not path.is_file():
         raise DetectorError(f"{path}: expected an ONNX file, found none")
     options = runtime.SessionOptions()
@@ -178,37 +269,52 @@ def _to_image(edges: Tensor, tiles: TileOutputs) -> Tensor:
     return torch.minimum(torch.maximum(boxes_xyxy, origin.repeat(2) - 0.5), end.repeat(2) - 0.5)
 
 
-def _runtime(path: Path) -> ModuleType:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise DetectorError(f"{path}: needs ONNX Runtime: pip install 'onnxruntime>=1.19'") from None
-    return onnxruntime
+def _runtime() -> ModuleType:
+    return importlib.import_module("onnxruntime")
 
 
-def _input_hw(
-    path: Path, inputs: Sequence[tuple[str, list[Any]]], size: tuple[int, int] | None
-) -> tuple[int, int]:
-    """Height and width of the graph's single image, px.
+def _input_type(path: Path, node: Any) -> type[np.generic]:
+    """The type of numbers that an input takes."""
+    if node.type not in _TYPES:
+        raise DetectorError(f"{path}: input {node.name}: expected {', '.join(_TYPES)}, found {node.type}")
+    return _TYPES[node.type]
+
+
+def _image_layout(
+    path: Path, images: Mapping[str, list[Any]], size: tuple[int, int] | None, required: bool
+) -> tuple[tuple[int, int], bool]:
+    """Height and width of the graph's image in px, and whether its channels come last.
 
     Args:
         path: The ONNX file.
-        inputs: Names and shapes.
-        size: From a YAML file, for open sides.
+        images: Shapes of the inputs by name, without `_SIDE_INPUTS`.
+        size: From a YAML file or the graph's metadata, for open sides.
+        required: Whether fixed sides must be this size.
     """
-    shape = inputs[0][1] if len(inputs) == 1 else []
-    output = len(shape) == 3 or (len(shape) == 4 and (shape[0] == 1 or not isinstance(shape[0], int)))
-    if output and (shape[-3] == 3 or not isinstance(shape[-3], int)):
-        fixed = tuple(side if isinstance(side, int) else None for side in shape[-2:])
+    shape = next(iter(images.values())) if len(images) == 1 else []
+    sides = shape[-3:]
+    batch = shape[0] if len(shape) == 4 and isinstance(shape[0], int) else 1
+    has_channels = len(shape) in (3, 4) and (3 in (sides[0], sides[2]) or not isinstance(sides[0], int))
+    if has_channels and 1 <= batch <= _MAX_BATCH:
+        channels_last = sides[2] == 3 and sides[0] != 3
+        fixed = [side if isinstance(side, int) else None for side in (sides[:2] if channels_last else sides[1:])]
         if not all(side is None or 1 <= side <= MAX_SIDE for side in fixed):
             raise DetectorError(f"{path}: expected an input of 1 to {MAX_SIDE} px a side, found {shape}")
         if size is not None and all(side in (None, given) for side, given in zip(fixed, size, strict=True)):
-            return size
-        if size is None and None not in fixed:
-            return fixed[0] or 0, fixed[1] or 0
-    found = ", ".join(f"{name} {shape}" for name, shape in inputs)
+            return size, channels_last
+        if None not in fixed and not required:
+            return (fixed[0] or 0, fixed[1] or 0), channels_last
+    found = ", ".join(f"{name} {shape}" for name, shape in images.items())
     expected = f"of {size[0]} x {size[1]}" if size else "of fixed size (or `size` in a YAML file)"
     raise DetectorError(f"{path}: expected one input (1, 3, height, width) {expected}, found {found}")
+
+
+def _exported_size(facts: Mapping[str, str]) -> tuple[int, int] | None:
+    """Height and width of the image, px, as Ultralytics' export writes them: "[640, 640]"."""
+    try:
+        return validate_settings({"size": ast.literal_eval(facts.get("imgsz", ""))}, "imgsz")["size"]
+    except (DetectorError, ValueError, SyntaxError, TypeError):
+        return None
 
 
 def _names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:

@@ -18,7 +18,7 @@ from detectors.files import read_text
 
 Resize = Literal["letterbox", "stretch"]
 Channels = Literal["rgb", "bgr"]
-Activation = Literal["none", "sigmoid", "softmax"]
+Activation = Literal["none", "sigmoid", "softmax", "exp"]
 BoxFormat = Literal["xyxy", "cxcywh", "xywh", "yxyx"]
 Input = Literal["batch", "image", "list"]
 
@@ -92,7 +92,7 @@ class NetworkSpec:
     normalised: bool = False
     """Whether boxes are shares of the input's size instead of px."""
     activation: Activation | None = None
-    """Activation to apply to scores."""
+    """Activation to apply to scores; exp for logarithms of probabilities."""
     classes: tuple[str, ...] | None = None
     """One name per column of scores; "" for none."""
     t_star: float | None = None

@@ -35,8 +35,7 @@ def yolov5(classes: int = 3, places: int = 40) -> torch.Tensor:
 
 
 def read(outputs, settings=None, names=("a", "b", "c")):
-    shapes = [tuple(output.shape) for output in outputs]
-    found = make_decoder(shapes, INPUT_HW, settings or {}, names, "own")
+    found = make_decoder(outputs, INPUT_HW, settings or {}, names, "own")
     boxes, scores = found.decode(outputs, INPUT_HW)
     image, place, label = (scores > 0.1).nonzero()[0].tolist()
     return found, boxes[image, place].tolist(), found.classes[label], float(scores[image, place, label])
@@ -123,7 +122,7 @@ def test_what_no_format_reads() -> None:
 
 
 def test_labels_beyond_the_classes_are_nothing() -> None:
-    found = make_decoder([(1, 4), (1,), (1,)], INPUT_HW, {}, ("a",), "own")
+    found = make_decoder(CHOSEN, INPUT_HW, {}, ("a",), "own")
     assert float(found.decode(CHOSEN, INPUT_HW)[1].sum()) == 0
 
 
