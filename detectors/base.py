@@ -202,6 +202,12 @@ class Predictor(Protocol):
         ...
 
 
+def explain_missing_gradient(predictor: Predictor) -> str:
+    """Why a detector that could have had a gradient has none, in brackets; empty if it could not."""
+    reason = getattr(predictor, "gradient_obstacle", "")
+    return f" ({reason})" if reason else ""
+
+
 def detector_device(predictor: Predictor) -> torch.device:
     """The device of a detector's weights; the CPU if it has no visible weights."""
     tensors = chain(predictor.parameters(), predictor.buffers()) if isinstance(predictor, nn.Module) else ()

@@ -10,7 +10,7 @@ import contextlib
 import copy
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detectors import boxes
+from detectors.adapters.formats import OutputDecoder
 from detectors.base import (
     Detector,
     DetectorError,
@@ -114,6 +115,114 @@ class ContractReport:
             details = "; ".join(f"{finding.name}: {finding.detail}" for finding in self.failed)
             raise DetectorError(f"detector {self.detector!r} violates the contract: {details}")
         return self
+
+
+CAR = "Car"
+TINY_PX = 4.0
+"""Cars in photographs of streets are higher than this, px."""
+_SAME_PLACE_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class StreetDetections:
+    """Cars that a detector finds in pictures of streets with cars."""
+
+    pictures: int
+    """Number of pictures."""
+    boxes: int
+    """Cars with a score of at least t*."""
+    score_low: float | None
+    """Lowest score of all detections, of any class; None if there is none."""
+    score_high: float | None
+    """Highest score."""
+    height_low_px: float | None
+    """Height of the lowest of the boxes, px."""
+    height_high_px: float | None
+    """Height of the highest, px."""
+    problem: str | None
+    """Why this is no detector of cars, as far as the pictures show; None if nothing is wrong."""
+
+    @property
+    def as_check(self) -> ContractCheck:
+        """As a check of the contract."""
+        if self.problem is not None:
+            return ContractCheck(STREET_CHECK, "failed", self.problem)
+        heights = f"{self.height_low_px or 0:.0f} to {self.height_high_px or 0:.0f} px high"
+        scores = f"scores {self.score_low or 0:.2f} to {self.score_high or 0:.2f}"
+        return ContractCheck(
+            STREET_CHECK, "ok", f"{self.boxes} cars in {self.pictures} streets, {heights}; {scores}"
+        )
+
+
+STREET_CHECK = "cars on streets"
+"""Name of the check on pictures of streets."""
+
+
+def survey_streets(
+    detector: Predictor, pictures: Iterable[Tensor], t_star: float, until_found: bool = False
+) -> tuple[StreetDetections, list[Detections]]:
+    """Detect cars in pictures of streets with cars.
+
+    Args:
+        detector: The detector under test.
+        pictures: Each (3, H, W) in [0, 1], on the detector's device.
+        t_star: Lowest score of a detection that counts.
+        until_found: End with the first picture in which cars are found.
+
+    Returns:
+        What was found in them, and the detections in each.
+    """
+    found: list[Detections] = []
+    label = detector.classes.index(CAR) if CAR in detector.classes else -1
+    for picture in pictures:
+        found.extend(predict(detector, picture[None]))
+        survey = _summarise_streets(found, label, t_star)
+        if until_found and survey.boxes and survey.problem is None:
+            break
+    survey = _summarise_streets(found, label, t_star)
+    if label < 0:
+        survey = replace(survey, problem=f"no class {CAR} among {', '.join(detector.classes[:6])}")
+    reading = describe_reading(detector)
+    if survey.problem is not None and reading:
+        survey = replace(survey, problem=f"{survey.problem}; {reading}")
+    return survey, found
+
+
+def describe_reading(detector: Predictor) -> str:
+    """How a network's outputs are read, and what else they could be; empty for other detectors."""
+    decoder = getattr(detector, "decoder", None)
+    return decoder.describe() if isinstance(decoder, OutputDecoder) else ""
+
+
+def _summarise_streets(found: Sequence[Detections], label: int, t_star: float) -> StreetDetections:
+    cars = [one.boxes_xyxy[(one.labels == label) & (one.scores >= t_star)] for one in found]
+    boxes_xyxy = torch.cat(cars) if cars else torch.zeros(0, 4)
+    scores = torch.cat([one.scores for one in found]) if found else torch.zeros(0)
+    sides = boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]
+    low, high = (float(scores.min()), float(scores.max())) if len(scores) else (None, None)
+    problem = None
+    if low is not None and high is not None and not 0 <= low <= high <= 1:
+        problem = f"scores outside [0, 1], from {low:.3g} to {high:.3g}"
+    elif not len(boxes_xyxy):
+        best = f"the best score is {high:.3g}" if high is not None else "no detection at all"
+        of_cars = [float(one.scores[one.labels == label].max()) for one in found if (one.labels == label).any()]
+        if of_cars:
+            best = f"the best score of one is {max(of_cars):.3g}"
+        problem = f"no car with a score of {t_star:.3g} or more in {len(found)} pictures ({best})"
+    elif float(sides.amax(1).max()) < TINY_PX:
+        problem = f"only boxes with sides below {TINY_PX:g} px"
+    elif len(boxes_xyxy) > 1 and float((boxes_xyxy - boxes_xyxy[0]).abs().max()) < _SAME_PLACE_PX:
+        problem = f"{len(boxes_xyxy)} times the same box, {_format_box(boxes_xyxy[0])}"
+    heights = sides[:, 1]
+    return StreetDetections(
+        len(found),
+        len(boxes_xyxy),
+        low,
+        high,
+        float(heights.min()) if len(heights) else None,
+        float(heights.max()) if len(heights) else None,
+        problem,
+    )
 
 
 class _Violation(Exception):  # noqa: N818  (ends one check)

@@ -103,6 +103,14 @@ class OutputDecoder:
         """Class names that labels index."""
         return tuple(name for name in self.spec.classes or () if name != NO_CLASS)
 
+    def describe(self) -> str:
+        """How the outputs are read, and what else they could be."""
+        spec = self.spec
+        pixels = f"{spec.channels.upper()} in [0, {spec.scale:g}]" + (", normalised" if any(spec.mean) else "")
+        other = f"{' or '.join(self.alternatives)} is possible too (`format` in a YAML file)"
+        reading = f"read as {self.format.name}, input {pixels}, {spec.resize}"
+        return f"{reading}; {other}" if self.alternatives else reading
+
     def decode(self, outputs: Sequence[Tensor], input_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Boxes (B, A, 4) px of the input, edges measured from its corner, and scores (B, A, C) in [0, 1]."""
         boxes, scores = self.format.read(_leave_masks_aside(outputs), input_hw, self.spec)
@@ -140,7 +148,7 @@ def make_decoder(
         expected = ", ".join(f.name for f in FORMATS)
         raise DetectorError(f"{where}: format: expected one of {expected}, found {format_name!r}")
     fitting = [f for f in FORMATS if f.fits(measured.shapes, input_hw)]
-    # what the user names counts, whatever the values suggest
+    # a format that the user names wins over what the values suggest
     likely = [f for f in fitting if f.name == format_name or (format_name is None and f.is_likely(measured))]
     if not likely:
         found = ", ".join(str(list(output.shape)) for output in outputs) or "none"
@@ -556,7 +564,7 @@ def _cells(shapes: Sequence[Shape], columns: int) -> dict[int, int]:
 
 NANODET = "nanodet"
 _PAIRS = ("detr", "rfdetr", "rtdetr", "ssd")
-"""Formats with boxes and scores apart, whose conventions are measured."""
+"""Formats with boxes and scores apart; their conventions are measured."""
 _GREY = 114 / 255
 _ULTRALYTICS = NetworkSpec(pad=_GREY, boxes="cxcywh")
 """RGB in [0, 1], padded with its grey."""

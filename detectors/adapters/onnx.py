@@ -42,30 +42,27 @@ _LOG_ERRORS = 3
 """ONNX Runtime's log level for errors only."""
 
 
-@dataclass(frozen=True, slots=True)
-class TileOutputs:
-    """The network's outputs for one tile of one image."""
-
-    tile: Tile
-    """The tile."""
-    outputs: tuple[Tensor, ...]
-    """One tensor per output."""
-    placement: ImagePlacement
-    """Where the tile lies in the network's input."""
+GraphRunner = Callable[[Tensor, NetworkSpec], Sequence[Tensor]]
+"""Maps an image (1, 3, h, w), RGB in [0, 1], of the graph's size, and the settings to the graph's outputs."""
 
 
 @dataclass(frozen=True, slots=True)
 class OnnxPredictions:
-    """The network's outputs for all tiles of B images."""
+    """Boxes and scores of all tiles of B images."""
 
-    images: tuple[tuple[TileOutputs, ...], ...]
-    """The tiles of each image."""
+    tiles: tuple[Tile, ...]
+    """The tiles of every image."""
+    predictions: tuple[tuple[tuple[Tensor, Tensor], ...], ...]
+    """For each image and tile, boxes (A, 4) px of the image and scores (A, C)."""
     image_hw: tuple[int, int]
     """Size of the images, px."""
 
 
 class OnnxPredictor:
     """A detector from an ONNX file: images (B, 3, H, W), RGB in [0, 1], any size."""
+
+    gradient_obstacle = ""
+    """Why it has no gradient, if one was to be had."""
 
     def __init__(self, path: Path, tiling: str = "auto", spec: Path | None = None) -> None:
         """Load the graph, with as many threads as torch has now.
@@ -82,13 +79,13 @@ class OnnxPredictor:
         if tiling not in TILINGS:
             raise DetectorError(f"tiles: expected {' or '.join(TILINGS)}, found {tiling!r}")
         graph = OnnxGraph(path, spec)
-        self._graph = graph
+        self.graph = graph
         self.input_hw = graph.input_hw
-        self._decoder = graph.decoder
+        self.decoder = graph.decoder
         self._spec = graph.decoder.spec
-        self.format = self._decoder.format
+        self.format = self.decoder.format
         self.name = path.stem
-        self.classes = self._decoder.classes
+        self.classes = self.decoder.classes
         if self._spec.t_star is not None:
             self.t_star = self._spec.t_star
         self._nms_iou = NMS_IOU if self._spec.nms_iou is None else self._spec.nms_iou
@@ -97,40 +94,66 @@ class OnnxPredictor:
 
     def forward(self, images: Tensor) -> OnnxPredictions:
         """images (B, 3, H, W), RGB in [0, 1]; no gradient."""
-        height, width = images.shape[2:]
-        whole = [Tile(0, 0, width, height)]
-        parts = make_tiles(height, width, self.input_hw) if self._tiling == "auto" else whole
-        tiles = tuple(tuple(self._run_tile(image, tile) for tile in parts) for image in images.detach())
-        return OnnxPredictions(tiles, (height, width))
+        height, width = int(images.shape[2]), int(images.shape[3])
+        parts = self.tiles(height, width)
+        images = images.detach().float().cpu()
+        predictions = (tuple(self.predict_tile(image, tile, self.graph.run) for tile in parts) for image in images)
+        return OnnxPredictions(parts, tuple(predictions), (height, width))
 
     def decode(self, raw: OnnxPredictions) -> list[Detections]:
         """One Detections per image, best first, boxes inside the image."""
-        return [self._merge(tiles, raw.image_hw) for tiles in raw.images]
+        return [
+            self.merge([(tile, *of_tile) for tile, of_tile in zip(raw.tiles, found, strict=True)], raw.image_hw)[0]
+            for found in raw.predictions
+        ]
 
-    def _run_tile(self, image: Tensor, tile: Tile) -> TileOutputs:
-        part = image[None, :, tile.y0 : tile.y1, tile.x0 : tile.x1].float().cpu()
+    def tiles(self, height: int, width: int) -> tuple[Tile, ...]:
+        """The tiles of an image of this size, px; the whole image comes first."""
+        if self._tiling == "auto":
+            return tuple(make_tiles(height, width, self.input_hw))
+        return (Tile(0, 0, width, height),)
+
+    def predict_tile(self, image: Tensor, tile: Tile, run: GraphRunner) -> tuple[Tensor, Tensor]:
+        """Boxes (A, 4) px of the image, clipped to a tile, and scores (A, C); differentiable if `run` is.
+
+        Args:
+            image: (3, H, W), RGB in [0, 1].
+            tile: A part of it.
+            run: Runs the graph.
+        """
+        part = image[None, :, tile.y0 : tile.y1, tile.x0 : tile.x1]
         network_input, placement = fit_images(part, self._spec)
-        return TileOutputs(tile, tuple(self._graph.run(network_input, self._spec)), placement)
+        (edges,), (scores,) = self.decoder.decode(run(network_input, self._spec), self.input_hw)
+        return _to_image(edges, tile, placement), scores
 
-    def _merge(self, tiles: Sequence[TileOutputs], image_hw: tuple[int, int]) -> Detections:
+    def merge(
+        self, tiles: Sequence[tuple[Tile, Tensor, Tensor]], image_hw: tuple[int, int]
+    ) -> tuple[Detections, Tensor]:
+        """The detections of an image's tiles, and which of them a tile border cuts.
+
+        Args:
+            tiles: Each tile with its boxes (A, 4) px of the image and their scores (A, C).
+            image_hw: Size of the image, px.
+
+        Returns:
+            Detections, best first, and (M,) bool.
+        """
         per_tile: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
-        for tile_outputs in tiles:
-            (edges,), (all_scores,) = self._decoder.decode(tile_outputs.outputs, self.input_hw)
+        for tile, edges, all_scores in tiles:
             cells, labels = (all_scores > self._least_score).nonzero(as_tuple=True)
-            scores = all_scores[cells, labels]
-            boxes_xyxy = _to_image(edges[cells], tile_outputs)
+            scores, boxes_xyxy = all_scores[cells, labels], edges[cells]
             # Boxes in the padding have no area left in the image.
             inside = boxes.area(boxes.clip(boxes_xyxy, *image_hw)) > 0
             boxes_xyxy, scores, labels = boxes_xyxy[inside], scores[inside], labels[inside]
             selected = boxes.nms(boxes_xyxy, scores, self._nms_iou, labels)
             boxes_xyxy = boxes_xyxy[selected]
-            is_cut = is_cut_by_tile(boxes_xyxy, tile_outputs.tile, image_hw)
+            is_cut = is_cut_by_tile(boxes_xyxy, tile, image_hw)
             per_tile.append((boxes_xyxy, scores[selected], labels[selected], is_cut))
         boxes_xyxy, scores, labels, is_cut = (torch.cat(parts) for parts in zip(*per_tile, strict=True))
         if len(tiles) > 1:
             selected = merge_tiles(boxes_xyxy, scores, labels, is_cut)
-            boxes_xyxy, scores, labels = boxes_xyxy[selected], scores[selected], labels[selected]
-        return Detections(boxes.clip(boxes_xyxy, *image_hw), labels, scores)
+            boxes_xyxy, scores, labels, is_cut = (x[selected] for x in (boxes_xyxy, scores, labels, is_cut))
+        return Detections(boxes.clip(boxes_xyxy, *image_hw), labels, scores), is_cut
 
 
 _SIDE_INPUTS: dict[str, Callable[[tuple[int, int]], list[float]]] = {
@@ -165,6 +188,10 @@ class OnnxGraph:
     """Size of the image that it takes, px."""
     decoder: OutputDecoder
     """Decodes its outputs; has the complete settings."""
+
+    def __deepcopy__(self, _: Any) -> OnnxGraph:
+        """Itself: it does not change, and a session cannot be copied."""
+        return self
 
     def __init__(self, path: Path, spec: Path | None = None) -> None:
         """Load a graph and run it once.
@@ -202,18 +229,36 @@ class OnnxGraph:
 
     def run(self, network_input: Tensor, spec: NetworkSpec) -> list[Tensor]:
         """The outputs for an image (1, 3, *input_hw), RGB in [0, 1], that fits the graph's size."""
-        image = normalise_images(network_input, spec)
-        image = image.permute(0, 2, 3, 1) if self._channels_last else image
-        given = image.expand(self._batch, -1, -1, -1).numpy() if self._is_batch else image[0].numpy()
-        if not np.issubdtype(self._type, np.floating):
-            given = np.clip(np.rint(given), 0, 255)
+        given = self._prepare(network_input, spec).numpy()
         feeds = {self._image: np.ascontiguousarray(given, self._type), **self._others}
         if self._is_bfloat16:  # numpy has no such type
             values = {name: _runtime().OrtValue.ortvalue_from_numpy(array) for name, array in feeds.items()}
             outputs = [torch.from_dlpack(v) for v in self.session.run_with_ort_values(self._outputs, values)]
         else:
             outputs = [torch.from_numpy(np.asarray(one)) for one in self.session.run(self._outputs, feeds)]
-        # copies of the image fill a batch of fixed size
+        return self._first_of_batch(outputs)
+
+    def run_converted(self, network: Any, network_input: Tensor, spec: NetworkSpec) -> list[Tensor]:
+        """`run` by the graph as a torch module of onnx2pytorch; differentiable. Whole numbers that the graph takes are
+        rounded floats here, whose gradient is that of the unrounded ones.
+        """
+        given = self._prepare(network_input, spec)
+        given = given.half() if self._type is np.float16 else given
+        others = {name: torch.from_numpy(array).to(given.device) for name, array in self._others.items()}
+        outputs = network(**{self._image: given}, **others)
+        named = dict(zip(network.output_names, [outputs] if isinstance(outputs, Tensor) else outputs, strict=True))
+        return self._first_of_batch([named[name] for name in self._outputs])
+
+    def _prepare(self, network_input: Tensor, spec: NetworkSpec) -> Tensor:
+        """The graph's image; differentiable."""
+        image = normalise_images(network_input, spec)
+        if not np.issubdtype(self._type, np.floating):
+            image = image + (image.round().clamp(0, 255) - image).detach()
+        image = image.permute(0, 2, 3, 1) if self._channels_last else image
+        return image.expand(self._batch, -1, -1, -1) if self._is_batch else image[0]
+
+    def _first_of_batch(self, outputs: Sequence[Tensor]) -> list[Tensor]:
+        """Outputs for the image; copies of it fill a batch of fixed size."""
         return [one[:1] if self._batch > 1 and one.shape[:1] == (self._batch,) else one for one in outputs]
 
     def _measure(
@@ -260,11 +305,11 @@ def open_session(path: Path) -> Any:
         raise DetectorError(f"{path}: expected an ONNX graph, found {_first_line(error)}") from None
 
 
-def _to_image(edges: Tensor, tiles: TileOutputs) -> Tensor:
+def _to_image(edges: Tensor, tile: Tile, placement: ImagePlacement) -> Tensor:
     """Boxes (N, 4) of the network's input, as pixel edges, in px of the image, clipped to the tile."""
-    origin = edges.new_tensor([tiles.tile.x0, tiles.tile.y0])
-    end = edges.new_tensor([tiles.tile.x1, tiles.tile.y1])
-    boxes_xyxy = tiles.placement.to_image(edges) + origin.repeat(2)
+    origin = edges.new_tensor([tile.x0, tile.y0])
+    end = edges.new_tensor([tile.x1, tile.y1])
+    boxes_xyxy = placement.to_image(edges) + origin.repeat(2)
     # Pixel centres are integers: the first pixel's left edge is at -1/2.
     return torch.minimum(torch.maximum(boxes_xyxy, origin.repeat(2) - 0.5), end.repeat(2) - 0.5)
 

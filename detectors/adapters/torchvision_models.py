@@ -118,10 +118,11 @@ def load_torchvision(name: str, weights: str = "default", spec: Path | None = No
             get_model_weights,
             list_models,
         )
-    except ImportError:
-        raise DetectorError(
-            f"torchvision:{name}: needs torchvision: pip install 'drivesem[torchvision]'"
-        ) from None
+    except ModuleNotFoundError:
+        raise DetectorError(f"torchvision:{name}: needs torchvision: drivesem doctor has the command") from None
+    except (ImportError, RuntimeError) as error:
+        expected = f"a torchvision that fits torch {torch.__version__} (drivesem doctor has the command)"
+        raise DetectorError(f"torchvision:{name}: expected {expected}, found {error}") from None
     known = [n for n in list_models(detection) if not n.startswith(("maskrcnn", "keypointrcnn"))]
     if name not in known:
         raise DetectorError(f"torchvision: expected one of {', '.join(known)}, found {name!r}")

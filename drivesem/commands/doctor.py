@@ -5,6 +5,7 @@ Each feature is checked in a process of its own, since an import may abort; this
 
 from __future__ import annotations
 
+import importlib.metadata
 import platform
 import subprocess
 import sys
@@ -89,6 +90,19 @@ _TORCHVISION = (
     "import torch, torchvision; from torchvision.ops import nms; "
     "nms(torch.tensor([[0.0, 0.0, 1.0, 1.0]]), torch.ones(1), 0.5); print(torchvision.__version__)"
 )
+
+
+def _torchvision_command() -> str:
+    """The command that installs the torchvision of the installed torch, from torch's own index for other builds."""
+    try:
+        version = importlib.metadata.version("torch")
+    except importlib.metadata.PackageNotFoundError:
+        return "pip install 'drivesem[torchvision]'"
+    build = version.partition("+")[2]
+    index = f" --index-url https://download.pytorch.org/whl/{build}" if build else ""
+    return f"pip install torchvision torch=={version}{index}"
+
+
 _BROWSER = (
     "import shutil, playwright; path = shutil.which('chromium'); "
     "assert path, 'no chromium on the path'; print(path)"
@@ -124,7 +138,7 @@ FEATURES = (
         "pip install 'drivesem[onnx]'",
         _version_code("onnxruntime"),
     ),
-    OptionalFeature("torchvision", "torchvision's detectors", "pip install 'drivesem[torchvision]'", _TORCHVISION),
+    OptionalFeature("torchvision", "torchvision's detectors", _torchvision_command(), _TORCHVISION),
     OptionalFeature(
         "mitsuba",
         "the second renderer of objects, with ray-traced light (classify confirm)",

@@ -37,6 +37,7 @@ from drivesem.config.options import (
     ClassMap,
     CommandConfig,
     Count,
+    DataSourceOptions,
     DetectionOptions,
     DeviceOption,
     Flag,
@@ -574,15 +575,15 @@ class EvalConfig(FrameFilterOptions, TileOption, WorkerOptions, CommandConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckConfig(TileOption, DeviceOption, CommandConfig):
+class CheckConfig(TileOption, DeviceOption, DataSourceOptions, CommandConfig):
     """Test a detector against the contract, and see what it detects. Exit code 1 if a promise is broken."""
 
     detector: str
     """Detector: shipped, a weights file, or another project's."""
     size: str = "320x192"
     """Size of the test pictures, WIDTHxHEIGHT, px."""
-    seed: int = 0
-    """Seed of the pictures and of the directions of finite differences."""
+    out: PictureFile = None
+    """File of a picture of the streets with the detected boxes, PNG or JPEG; an existing one is replaced."""
 
 
 @dataclass(frozen=True, kw_only=True)

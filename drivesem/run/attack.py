@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from detectors.base import Detector, DetectorError, Predictor, detector_device
+from detectors.base import Detector, DetectorError, Predictor, detector_device, explain_missing_gradient
+from detectors.check import survey_streets
 from detectors.registry import load_detector, load_predictor
 from drivesem.attacks.budgets import format_budget, parse_budget, resolve_parameters
 from drivesem.attacks.changes import (
@@ -73,6 +74,8 @@ SECOND_DETECTORS = ("yolov3-slim", "squeezedet")
 GRADIENT_FREE_FALLBACK = "climb"
 """Default method for detectors without a gradient: of methods without one, it finds most certain failures."""
 _METHODS_WITHOUT_GRADIENT = (*GRADIENT_FREE_METHODS, "corners", GRADIENT_FREE_FALLBACK)
+SURVEYED_FRAMES = 8
+"""Photographs of which one must have a car that the detector finds."""
 _FIXED_PASSES = 3
 """Detector passes of a frame that no method controls."""
 WRITTEN = (PLAN, METRICS, MANIFEST, "report.html", FRAMES)
@@ -92,7 +95,8 @@ def attack_dataset(config: AttackConfig) -> RunSummary:
     worker = AttackWorker.from_config(usable_config, detector)
     if usable_config.method != config.method:
         replacement = f"--method {usable_config.method} takes the place of {config.method}"
-        sys.stderr.write(f"{config.detector} has no gradient: {replacement}\n")
+        reason = explain_missing_gradient(detector)
+        sys.stderr.write(f"{config.detector} has no gradient{reason}: {replacement}\n")
     config = usable_config
     out = Path(config.out) if config.out else Path("runs") / _run_name(config, worker.params)
     claim_folder(out, config, WRITTEN)
@@ -102,8 +106,9 @@ def attack_dataset(config: AttackConfig) -> RunSummary:
     names, without_vehicles, failed = select_frames(worker.source, config)
     _check_any_frame(config, names, without_vehicles, failed)
     names = _select_part(names, config.part)
+    _check_detections(worker, names)
     jobs = run_frame_jobs(*_prepare_jobs(worker, names, out))
-    return _finish_run(worker, names, out, jobs, start, without_vehicles, failed, True, account)
+    return _finish_run(worker, names, out, jobs, start, without_vehicles, failed, account)
 
 
 def attack_frames(worker: AttackWorker, names: Sequence[str], out: Path) -> RunSummary:
@@ -149,7 +154,6 @@ def _finish_run(
     start: float,
     without_vehicles: int = 0,
     failed: Mapping[str, str] | None = None,
-    require_detections: bool = False,
     account: Mapping[str, Any] | None = None,
 ) -> RunSummary:
     """Summarise the frames of a run and write its files.
@@ -162,7 +166,6 @@ def _finish_run(
         start: time.perf_counter() at the start of the run.
         without_vehicles: number of frames that were passed over.
         failed: frames that could not be read, with the reason.
-        require_detections: raise UsageError where the detector finds nothing in any photograph.
         account: files and label rows of the data set, as JSON.
     """
     config, failed = worker.config, {**(failed or {}), **jobs.failed}
@@ -171,8 +174,6 @@ def _finish_run(
     if names and config.part is None:
         _check_any_frame(config, done, without_vehicles + len(empty), failed)
     results = [load_frame(out / FRAMES / name / RESULT) for name in done]
-    if require_detections:
-        _check_detections(worker, results)
     summary = replace(
         summarise_run(config, worker.params, worker.detector, results),
         frames_without_vehicles=without_vehicles + len(empty),
@@ -229,14 +230,24 @@ def write_run_summary(
     return summary
 
 
-def _check_detections(worker: AttackWorker, results: Sequence[FrameResult]) -> None:
-    """Raise UsageError for a detector that finds nothing in several photographs: it has nothing to lose."""
-    t_star = resolve_t_star(worker.detector, worker.config.t_star)
-    scores = [box.score or 0 for result in results for box in result.detections_benign]
-    if len(results) > 1 and max(scores, default=0) < t_star:
-        best = f"the best score is {max(scores):.3g}" if scores else "no detection at all"
-        actual = f"{best} in {len(results)} photographs (is its input prepared as in training? drivesem eval)"
-        raise UsageError("--detector", f"one that finds something, with a score of {t_star:.3g} or more", actual)
+def _check_detections(worker: AttackWorker, names: Sequence[str]) -> None:
+    """Raise UsageError for a detector that finds no car in the first photographs: it has nothing to lose."""
+    config = worker.config
+    t_star = resolve_t_star(worker.detector, config.t_star)
+    if len(names) < 2:
+        return
+
+    def photographs() -> Iterator[Tensor]:
+        for name in names[:SURVEYED_FRAMES]:
+            try:
+                yield worker.source.photograph(name).to(config.device)
+            except SceneError:  # the attack of the frame reports it
+                continue
+
+    survey, _ = survey_streets(worker.detector, photographs(), t_star, until_found=True)
+    if survey.pictures and survey.problem is not None:
+        expected = f"one that finds cars, with a score of {t_star:.3g} or more"
+        raise UsageError("--detector", expected, f"{survey.problem} (drivesem check --detector {config.detector})")
 
 
 def _resolve_budget(config: AttackConfig) -> AttackConfig:
@@ -562,11 +573,12 @@ def _check_detector(config: AttackConfig, detector: Predictor, needs_gradient: b
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     if isinstance(detector, Detector):
         return
+    without = f"{config.detector}, which has no gradient{explain_missing_gradient(detector)}"
     if needs_gradient:
-        expected = f"one of {', '.join(_METHODS_WITHOUT_GRADIENT)} for {config.detector}, which has no gradient"
+        expected = f"one of {', '.join(_METHODS_WITHOUT_GRADIENT)} for {without}"
         raise UsageError("--method", expected, config.method)
     if config.objective not in GRADIENT_FREE_TERMS:
-        expected = f"one of {', '.join(GRADIENT_FREE_TERMS)} for {config.detector}, which has no gradient"
+        expected = f"one of {', '.join(GRADIENT_FREE_TERMS)} for {without}"
         raise UsageError("--objective", expected, config.objective)
 
 

@@ -16,6 +16,8 @@ from scene_ir.errors import FormatError, SceneError
 from scene_ir.types import Frame, SceneIR
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from detectors.base import Predictor
     from drivesem.data.account import DataAccount
     from drivesem.data.photographs import FocalLength
@@ -44,6 +46,10 @@ class SceneSource(Protocol):
         """Whether the frame has a movable vehicle. Raises SceneError for a frame that cannot be read."""
         ...
 
+    def photograph(self, identifier: str) -> Tensor:
+        """Read the photograph (3, H, W) of a frame, in [0, 1]. Raises SceneError for a frame that cannot be read."""
+        ...
+
     def scene(self, identifier: str) -> SceneIR:
         """Make the scene of a frame. Raises SceneError for a frame that cannot be used."""
         ...
@@ -68,6 +74,9 @@ class DemoSource:
 
     def has_vehicles(self, identifier: str) -> bool:
         return True
+
+    def photograph(self, identifier: str) -> Tensor:
+        return self.scene(identifier).photograph
 
     def scene(self, identifier: str) -> SceneIR:
         from drivesem.synth.demo import demo_scene
@@ -97,6 +106,9 @@ class DatasetSource:
         from drivesem.data.classes import count_vehicles
 
         return count_vehicles(self._dataset.labels(identifier)) > 0
+
+    def photograph(self, identifier: str) -> Tensor:
+        return self._dataset.frame(identifier).photograph
 
     def scene(self, identifier: str) -> SceneIR:
         frame, settings = place_vehicles(self._dataset.frame(identifier), self._settings)
@@ -148,6 +160,9 @@ class PhotographSource:
         detections = detect(self._frame(identifier), self._finder)
         return any(self._finder.classes[int(label)] in VEHICLE_CLASSES for label in detections.labels)
 
+    def photograph(self, identifier: str) -> Tensor:
+        return self._frame(identifier).photograph
+
     def scene(self, identifier: str) -> SceneIR:
         from drivesem.scenes.label_free import detect, label_from_detections
 
@@ -177,6 +192,9 @@ class SceneFolderSource:
         from scene_ir.io import count_objects
 
         return count_objects(self._folders[identifier]) > 0
+
+    def photograph(self, identifier: str) -> Tensor:
+        return self.scene(identifier).photograph
 
     def scene(self, identifier: str) -> SceneIR:
         from scene_ir.io import load_scene

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.table import Table
+from torch import Tensor
 
 from detectors.base import DetectorError, Predictor
+from detectors.check import survey_streets
 from detectors.registry import load_predictor
 from detectors.types import Detections
 from drivesem.analysis.evaluate.conditions import (
@@ -50,7 +54,7 @@ from drivesem.run.detection_cache import detect_objects
 from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from drivesem.training.frames import adapt_limits, evaluation_targets
 from scene_ir import files
-from scene_ir.errors import FormatError
+from scene_ir.errors import FormatError, SceneError
 from scene_ir.io import to_uint8
 from scene_ir.types import Labels
 
@@ -75,6 +79,7 @@ def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
     detector = _detector(config)
     account = write_account(dataset.account())
     names = dataset.identifiers[: config.limit]
+    _warn_if_blind(config, dataset, detector, names)
     frame_detector, make_detector = _FrameDetector(config, dataset, detector), partial(_FrameDetector, config)
     jobs = run_frame_jobs(names, frame_detector, make_detector, config, ProgressSettings("frames", keep=False))
     names = [name for name in names if name in jobs.results]
@@ -134,6 +139,25 @@ def _draw(
         picture = draw_mistakes(to_uint8(dataset.frame(names[frame]).photograph), marks[frame])
         name = names[frame].replace("/", "_")
         files.write_png(Path(config.out or "") / "pictures" / f"{rank:03d}-{name}.png", picture)
+
+
+def _warn_if_blind(config: EvalConfig, dataset: Dataset, detector: Predictor, names: Sequence[str]) -> None:
+    """Print one line where the detector finds no car in the first frames that have some."""
+
+    def photographs() -> Iterator[Tensor]:
+        for name in names:
+            try:
+                frame = dataset.frame(name)
+            except SceneError:  # its evaluation reports it
+                continue
+            if frame.labels is not None and HEADLINE in frame.labels.kind:
+                yield frame.photograph.to(config.device)
+
+    pictures = islice(photographs(), SURVEYED_FRAMES)
+    survey, _ = survey_streets(detector, pictures, resolve_t_star(detector), until_found=True)
+    if survey.pictures and survey.problem is not None:
+        hint = f"drivesem check --detector {config.detector}"
+        sys.stderr.write(f"--detector {config.detector}: {survey.problem} ({hint})\n")
 
 
 def _detector(config: EvalConfig) -> Predictor:
@@ -217,6 +241,8 @@ def print_detector_metrics(metrics: DetectorMetrics, console: Console) -> None:
     )
 
 
+SURVEYED_FRAMES = 8
+"""Frames with cars of which one must have a car that the detector finds."""
 _LEGEND = (
     ("hit", TRUE_COLOUR),
     ("missed", LOST_COLOUR),

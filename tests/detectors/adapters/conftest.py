@@ -1,18 +1,10 @@
-"""ONNX files made by hand: a graph with one image input and constant outputs; random networks fit to be tested."""
+"""Random networks fit to be tested."""
 
 from collections.abc import Callable
 
 import pytest
 import torch
 from torch import nn
-
-from tools.onnx_graph import constant_graph as graph
-
-
-@pytest.fixture
-def constant_graph() -> Callable[..., bytes]:
-    """The maker of such files."""
-    return graph
 
 
 @pytest.fixture

@@ -72,6 +72,118 @@ def test_a_planted_box_is_read(name: str, outputs: list[torch.Tensor], score: fl
     assert value == pytest.approx(score)
 
 
+CAR = COCO_CLASSES.index("Car")
+CAR_91 = COCO_CLASSES_91.index("Car")
+CELLS = 16 * 8 + 8 * 4 + 4 * 2
+"""Cells of 8, 16 and 32 px in an input of 64 x 128."""
+
+
+def corners_and_scores() -> tuple[torch.Tensor, torch.Tensor]:
+    """One network's boxes (CELLS, 4) px around their cells, and scores (CELLS, 80): one car of 0.75, others low."""
+    places = []
+    for stride in (8, 16, 32):
+        y, x = torch.meshgrid(torch.arange(64 // stride), torch.arange(128 // stride), indexing="ij")
+        places.append((torch.stack((x, y), -1).reshape(-1, 2) + 0.5) * stride)
+    centres = torch.cat(places)
+    boxes = torch.cat((centres - 6, centres + 6), -1)
+    boxes[7] = torch.tensor(BOX)
+    scores = torch.full((CELLS, 80), 0.001)
+    scores[7, CAR] = 0.75
+    return boxes, scores
+
+
+def as_layout(name: str) -> list[torch.Tensor]:
+    """The network's outputs, exported in another layout."""
+    boxes, scores = corners_and_scores()
+    centred = torch.cat(((boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]), -1)
+    best, labels = scores.max(-1)
+    order = best.argsort(descending=True)[:50]
+    top, label, score = boxes[order], labels[order], best[order]
+    shares = torch.tensor([128.0, 64, 128, 64])
+    sure = torch.ones(CELLS, 1)
+    strides = torch.cat([torch.full((128 * 64 // s**2, 1), float(s)) for s in (8, 16, 32)])
+    grid = (corners_and_scores()[0][:, :2] + 6) / strides - 0.5
+    grid[7] = torch.tensor([7.0, 0])
+    raw = torch.cat((centred[:, :2] / strides - grid, (centred[:, 2:] / strides).log(), sure, scores), -1)
+    numbers = torch.tensor([i for i, one in enumerate(COCO_CLASSES_91) if one])
+    wide = torch.full((CELLS, 91), 1e-6).index_copy(1, numbers, scores)
+    with_background = torch.cat((1 - scores.sum(-1, keepdim=True), scores), -1)
+    layouts = {
+        "yolov8": [torch.cat((centred, scores), -1).T],
+        "transposed": [torch.cat((centred, scores), -1)],
+        "half": [torch.cat((centred, scores), -1).T.half()],
+        "masks": [torch.cat((centred, scores, torch.ones(CELLS, 32)), -1).T, torch.ones(32, 16, 32)],
+        "yolov5": [torch.cat((centred, sure, scores), -1)],
+        "yolox": [torch.cat((centred, sure, scores), -1)],
+        "yolox raw": [raw],
+        "tensorrt": [torch.tensor([50]), top, score, label.int()],
+        "yolov7": [torch.cat((0 * score[:, None], top, label[:, None], score[:, None]), -1)],
+        "mmdet": [torch.cat((top, score[:, None]), -1), label],
+        "paddle": [torch.cat((label[:, None], score[:, None], top), -1), torch.tensor([50])],
+        "end2end": [torch.cat((top, score[:, None], label[:, None]), -1)],
+        "tfod": [(top / shares)[:, [1, 0, 3, 2]], numbers[label].float(), score],
+        "torchvision": [top, numbers[label], score],
+        "rtdetr": [torch.logit(scores), centred / shares],
+        "rtdetr joined": [torch.cat((centred / shares, scores), -1)],
+        "rfdetr": [centred / shares, torch.logit(wide)],
+        "detr": [torch.cat((wide, 1 - wide.sum(-1, keepdim=True)), -1).log() + 3, centred / shares],
+        "ssd": [boxes, scores],
+        "ssd background": [with_background.log(), boxes / shares],
+    }
+    flat = name in ("yolov7", "paddle", "torchvision")
+    return layouts[name] if flat else [output[None] for output in layouts[name]]
+
+
+@pytest.mark.parametrize(
+    ("layout", "name", "settings", "nodes"),
+    [
+        ("yolov8", "yolov8", {}, ()),
+        ("transposed", "yolov8", {}, ()),
+        ("transposed", "yolov8", {"format": "yolov8"}, ()),
+        ("half", "yolov8", {}, ()),
+        ("masks", "yolov8", {}, ()),
+        ("yolov5", "yolov5", {}, ()),
+        ("yolox", "yolox", {"format": "yolox"}, ()),
+        ("yolox raw", "yolox", {}, ()),
+        ("tensorrt", "tensorrt", {}, ()),
+        ("yolov7", "yolov7", {}, ()),
+        ("mmdet", "mmdet", {}, ()),
+        ("paddle", "paddle", {}, ()),
+        ("end2end", "end2end", {}, ()),
+        ("end2end", "end2end", {"format": "end2end"}, ()),
+        ("tfod", "tfod", {}, ("detection_boxes", "detection_classes", "detection_scores")),
+        ("torchvision", "torchvision", {}, ()),
+        ("torchvision", "rtdetr-end2end", {"classes": COCO_CLASSES_91}, ("images", "orig_target_sizes")),
+        ("rtdetr", "rtdetr", {}, ()),
+        ("rtdetr joined", "rtdetr", {}, ()),
+        ("rfdetr", "rfdetr", {}, ()),
+        ("detr", "detr", {}, ()),
+        ("ssd", "ssd", {}, ()),
+        ("ssd background", "ssd", {}, ()),
+    ],
+)
+def test_one_network_in_every_layout(layout: str, name: str, settings: dict, nodes: tuple[str, ...]) -> None:
+    outputs = as_layout(layout)
+    found = make_decoder(outputs, INPUT_HW, settings, None, "own", nodes)
+    assert found.format.name == name
+    boxes, scores = found.decode(outputs, INPUT_HW)
+    image, place, label = (scores > 0.1).nonzero()[0].tolist()
+    assert len((scores > 0.1).nonzero()) == 1
+    assert found.classes[label] == "Car"
+    assert boxes[image, place].tolist() == pytest.approx(BOX, abs=0.05)
+    assert float(scores[image, place, label]) == pytest.approx(0.75, abs=1e-3)
+
+
+def test_a_named_format_wins_and_others_are_named() -> None:
+    outputs = as_layout("yolox")
+    guessed = make_decoder(outputs, INPUT_HW, {}, None, "own")
+    assert guessed.format.name == "yolov5"
+    assert "yolox" in guessed.alternatives
+    assert "yolox is possible too (`format` in a YAML file)" in guessed.describe()
+    named = make_decoder(outputs, INPUT_HW, {"format": "yolox"}, None, "own").spec
+    assert (named.channels, named.scale, named.centred) == ("bgr", 255.0, False)
+
+
 def test_other_boxes_and_activations() -> None:
     shares = [value / side for value, side in zip(BOX, (128, 64) * 2, strict=True)]
     boxes = torch.tensor([shares[1], shares[0], shares[3], shares[2]]).expand(1, 9, 4)

@@ -13,6 +13,7 @@ from detectors.adapters.onnx import OnnxPredictor
 from detectors.adapters.spec import COCO_NAMES, normalise_images
 from detectors.base import DetectorError, predict
 from detectors.registry import load_detector, load_predictor
+from tools.onnx_graph import constant_graph
 
 NANODET = Path(__file__).resolve().parents[4] / "shared" / "data" / "detectors" / "nanodet_m.onnx"
 SIDE = 64
@@ -45,7 +46,7 @@ Make = Callable[..., Path]
 
 
 @pytest.fixture
-def graph(constant_graph: Callable[..., bytes], tmp_path: Path) -> Make:
+def graph(tmp_path: Path) -> Make:
     """A file with constant outputs, for an input (1, 3, SIDE, SIDE) or another one."""
 
     def make(given: Mapping[str, np.ndarray], shape: tuple[int | str, ...] = (1, 3, SIDE, SIDE)) -> Path:
@@ -119,6 +120,54 @@ def test_what_lies_in_the_padding_is_nothing(graph: Make) -> None:
     rows[0, :2] = [10, 2, 50, 14, 0.9, CAR], [10, 10, 50, 30, 0.8, CAR]
     (found,) = predict(OnnxPredictor(graph({"out": rows}), "off"), torch.zeros(1, 3, 64, 128))
     torch.testing.assert_close(found.scores, torch.tensor([0.8]))
+
+
+def yolov8(dtype: type = np.float32) -> np.ndarray:
+    rows = np.zeros((1, 84, 100), dtype)
+    rows[0, :4, 7], rows[0, 4 + CAR, 7] = (30, 20, 40, 20), 0.75
+    return rows
+
+
+BFLOAT16 = torch.from_numpy(yolov8()).bfloat16().view(torch.uint16).numpy()
+
+
+@pytest.mark.parametrize(
+    ("shape", "output", "options", "yaml"),
+    [
+        ((1, 3, SIDE, SIDE), yolov8(), {}, ""),
+        ((1, 3, SIDE, SIDE), yolov8(), {"open_sides": True}, ""),
+        (("batch", 3, "height", "width"), yolov8(), {"open_sides": True}, "size: 64"),
+        (("batch", 3, "height", "width"), yolov8(), {"facts": {"imgsz": "[64, 64]"}}, ""),
+        ((4, 3, SIDE, SIDE), yolov8().repeat(4, 0), {}, ""),
+        ((1, SIDE, SIDE, 3), yolov8(), {}, ""),
+        ((1, 3, SIDE, SIDE), yolov8(np.float16), {"inputs": {"image": "float16"}}, ""),
+        ((1, 3, SIDE, SIDE), BFLOAT16, {}, ""),
+        ((1, SIDE, SIDE, 3), yolov8(), {"inputs": {"image": "uint8"}}, ""),
+        ((1, 3, SIDE, SIDE), yolov8(), {"inputs": {"image": "float32", "scale_factor": "float32"}}, ""),
+        ((1, 3, SIDE, SIDE), yolov8(), {"inputs": {"image": "float32", "orig_target_sizes": "int64"}}, ""),
+    ],
+)
+def test_a_graph_gets_what_it_declares(
+    shape: tuple[int | str, ...], output: np.ndarray, options: dict, yaml: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "own.onnx"
+    path.write_bytes(constant_graph(shape, {"output0": output}, **options))
+    if yaml:
+        path.with_suffix(".yaml").write_text(yaml)
+    predictor = OnnxPredictor(path)
+    (found,) = predict(predictor, torch.zeros(1, 3, SIDE, SIDE))
+    assert predictor.format.name == "yolov8"
+    assert found.boxes_xyxy.tolist() == [[9.5, 9.5, 49.5, 29.5]]
+    assert found.scores.tolist() == [0.75]
+
+
+def test_whole_numbers_are_8_bit_values(tmp_path: Path) -> None:
+    path = tmp_path / "own.onnx"
+    path.write_bytes(constant_graph((1, 3, SIDE, SIDE), {"output0": yolov8()}, inputs={"image": "uint8"}))
+    assert OnnxPredictor(path).decoder.spec.scale == 255
+    path.write_bytes(constant_graph((1, 3, SIDE, SIDE), {"output0": yolov8()}, inputs={"image": "bfloat16"}))
+    with pytest.raises(DetectorError, match=r"own\.onnx: input image: expected tensor\(float\), .*bfloat16"):
+        OnnxPredictor(path)
 
 
 def test_nothing_is_found_in_an_empty_picture(graph: Make) -> None:
@@ -197,7 +246,7 @@ def test_nanodet_is_recognised_and_threads_follow_torch() -> None:
     assert predictor.format.name == "nanodet"
     assert predictor.input_hw == (416, 416)
     assert predictor.classes.index("Car") == CAR
-    assert predictor._graph.session.get_session_options().intra_op_num_threads == torch.get_num_threads()
+    assert predictor.graph.session.get_session_options().intra_op_num_threads == torch.get_num_threads()
     raw = predictor.forward(torch.full((1, 3, 375, 1242), 0.5))
     assert [len(seen) for seen in raw.images] == [4]
     assert all(bool((d.scores <= 1).all()) for d in predictor.decode(raw))

@@ -20,8 +20,8 @@ class Broken(SqueezeDet):
 
 def test_a_detector_that_keeps_its_contract() -> None:
     captured = run_json("check", "--detector", "squeezedet", "--size", "96x64")
-    verdicts = {finding["name"]: finding["verdict"] for finding in captured["findings"]}
-    assert captured["gradients"]
+    verdicts = {finding["name"]: finding["verdict"] for finding in captured["promises"]}
+    assert captured["gradient"]
     assert verdicts["planted prediction"] == verdicts["gradient to the image"] == verdicts["frozen"] == "ok"
 
 
