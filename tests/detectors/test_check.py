@@ -1,5 +1,7 @@
 """The contract check: a small detector passes, and each violation is named."""
 
+import re
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -7,7 +9,7 @@ from torch import nn
 
 from detectors.adapters.dense import DenseDetector, DensePredictions
 from detectors.base import Candidates, DetectorError, predict
-from detectors.check import check_detector
+from detectors.check import check_detector, survey_streets
 from detectors.squeezedet import SqueezeDet
 from detectors.types import Detections
 
@@ -224,3 +226,54 @@ def test_squeezedet_decodes_an_injected_prediction() -> None:
     torch.testing.assert_close(found.boxes_xyxy, box[None])
     assert float(found.scores[0]) > 0.999
     assert len(predict(detector, torch.full((1, 3, 64, 128), 0.5))) == 1
+
+
+class FixedDetections:
+    """Finds the same number of boxes in each picture: those of the picture's number."""
+
+    name = "fixed"
+
+    def __init__(self, boxes: list[list[float]], scores: list[float], classes: tuple[str, ...] = ("bus", "Car")):
+        self.boxes, self.scores, self.classes, self.calls = boxes, scores, classes, 0
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        self.calls += 1
+        return images
+
+    def decode(self, raw: torch.Tensor) -> list[Detections]:
+        boxes = torch.tensor(self.boxes).reshape(-1, 4)
+        return [Detections(boxes, torch.ones(len(boxes), dtype=torch.int64), torch.tensor(self.scores))]
+
+
+CAR, FAR = [10.0, 10, 60, 40], [70.0, 20, 90, 32]
+
+
+@pytest.mark.parametrize(
+    ("boxes", "scores", "problem"),
+    [
+        ([CAR, FAR], [0.9, 0.6], None),
+        ([], [], r"no car with a score of 0.5 or more in 2 pictures \(no detection at all\)"),
+        ([CAR], [0.4], r"no car .* in 2 pictures \(the best score of one is 0.4\)"),
+        ([CAR, FAR], [3.5, 0.6], r"scores outside \[0, 1\], from 0.6 to 3.5"),
+        ([CAR, FAR], [0.9, -0.1], r"scores outside \[0, 1\], from -0.1 to 0.9"),
+        ([[5.0, 5, 7, 6], [9.0, 9, 11, 10]], [0.9, 0.6], "only boxes with sides below 4 px"),
+        ([CAR], [0.9], r"2 times the same box, \[10.0, 10.0, 60.0, 40.0\]"),
+    ],
+)
+def test_what_is_no_detector_of_cars(boxes: list[list[float]], scores: list[float], problem: str | None) -> None:
+    streets, found = survey_streets(FixedDetections(boxes, scores), torch.zeros(2, 3, *IMAGE_HW), 0.5)
+    assert len(found) == streets.pictures == 2
+    assert streets.as_check.verdict == ("ok" if problem is None else "failed")
+    if problem is None:
+        assert (streets.boxes, streets.height_low_px, streets.height_high_px) == (4, 12, 30)
+        assert (streets.score_low, streets.score_high) == (pytest.approx(0.6), pytest.approx(0.9))
+    else:
+        assert re.fullmatch(problem, streets.as_check.detail)
+
+
+def test_no_cars_to_find_and_pictures_until_one_is_found() -> None:
+    streets, _ = survey_streets(FixedDetections([CAR], [0.9], ("", "bus")), torch.zeros(2, 3, *IMAGE_HW), 0.5)
+    assert streets.problem == "no class Car among , bus"
+    detector = FixedDetections([CAR, FAR], [0.9, 0.6])
+    streets, _ = survey_streets(detector, torch.zeros(5, 3, *IMAGE_HW), 0.5, until_found=True)
+    assert (streets.pictures, detector.calls) == (1, 1)

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from detectors.base import DetectorError
 from detectors.files import read_state
-from detectors.registry import SHIPPED, load_detector, read_weights, save_detector, write_weights
+from detectors.registry import SHIPPED, load_detector, load_predictor, read_weights, save_detector, write_weights
 from detectors.squeezedet import ANCHOR_SIZES_WH, SqueezeDet, SqueezeDetPlus
 
 
@@ -200,3 +200,17 @@ def test_a_state_is_read_without_code_and_without_bombs(tmp_path: Path) -> None:
     path.symlink_to("/dev/zero")
     with pytest.raises(DetectorError, match=r"a\.pth: expected weights, found no regular file"):
         read_state(path, "weights")
+
+
+def test_a_file_with_a_comma_in_its_name(tmp_path: Path) -> None:
+    folder = tmp_path / "a,b"
+    folder.mkdir()
+    path, spec = folder / "own,1.py", folder / "own,1.yaml"
+    path.write_text(
+        "import torch\n\nclass Own(torch.nn.Module):\n    def forward(self, images):\n"
+        "        return torch.zeros(1, 6, 40) + images.mean()\n"
+    )
+    spec.write_text("classes: [Car, bus]\n")
+    assert load_predictor(f"module:{path}:Own,{spec}").classes == ("Car", "bus")
+    with pytest.raises(DetectorError, match=r"a,b/none\.onnx"):
+        load_predictor(f"onnx:{folder}/none.onnx")

@@ -87,3 +87,20 @@ def test_the_command_imports_no_feature() -> None:
 @pytest.mark.slow
 def test_this_machine_is_fit() -> None:
     assert run_json("doctor")["fit"]
+
+
+@pytest.mark.parametrize(
+    ("version", "command"),
+    [
+        ("2.9.1", "pip install torchvision torch==2.9.1"),
+        (
+            "2.9.1+cu128",
+            "pip install torchvision torch==2.9.1+cu128 --index-url https://download.pytorch.org/whl/cu128",
+        ),
+    ],
+)
+def test_torchvision_is_the_one_of_the_installed_torch(
+    version: str, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor.importlib.metadata, "version", lambda _: version)
+    assert doctor._torchvision_command() == command
