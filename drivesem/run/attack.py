@@ -246,8 +246,8 @@ def _check_detections(worker: AttackWorker, names: Sequence[str]) -> None:
 
     survey, _ = survey_streets(worker.detector, photographs(), t_star, until_found=True)
     if survey.pictures and survey.problem is not None:
-        expected = f"one that finds cars, with a score of {t_star:.3g} or more"
-        raise UsageError("--detector", expected, f"{survey.problem} (drivesem check --detector {config.detector})")
+        found = f"{survey.problem} (drivesem check --detector {config.detector})"
+        raise UsageError("--detector", "one that finds cars", found)
 
 
 def _resolve_budget(config: AttackConfig) -> AttackConfig:

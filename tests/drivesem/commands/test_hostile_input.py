@@ -298,7 +298,7 @@ def test_a_detector_without_detections_is_not_attacked(tmp_path: Path, monkeypat
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Blind())
     words = ("attack", "--method", "random", "--queries", "1", "--workers", "1", "--params", "weather")
     line = refusal(*words, "--limit", "2", "--out", tmp_path / "run")
-    assert line.startswith("--detector: expected one that finds cars, with a score of 0.5 or more")
+    assert line.startswith("--detector: expected one that finds cars, found no car")
     assert "no car with a score of 0.5 or more in 2 pictures (no detection at all)" in line
     assert not (tmp_path / "run" / "metrics.json").exists()
     # One photograph in which nothing is found says nothing of the detector.
