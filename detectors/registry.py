@@ -15,7 +15,14 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from detectors import ensemble, planted
-from detectors.base import Detector, DetectorError, Predictor, disable_tf32, prepare_for_inference
+from detectors.base import (
+    Detector,
+    DetectorError,
+    Predictor,
+    disable_tf32,
+    explain_missing_gradient,
+    prepare_for_inference,
+)
 from detectors.files import read_file, read_text, write_atomically
 from detectors.squeezedet import SqueezeDet, SqueezeDetPlus
 from detectors.types import CLASSES
@@ -31,11 +38,15 @@ SHIPPED = {
 }
 """Weights of the detectors that come with the package."""
 
-ONNX = "onnx:"
-"""Prefix of an ONNX graph: onnx:FILE."""
+ONNX = "onnx"
+"""Kind of an ONNX graph, onnx:FILE: with a gradient if it can be converted."""
+ONNX_RUNTIME = "onnx-runtime"
+"""Kind of an ONNX graph without a gradient."""
+HUGGING_FACE = "hf"
+"""Kind of a model of transformers: hf:FOLDER or hf:NAME."""
 DARKNET = "darknet:"
 """Prefix of Darknet files: darknet:FILE.cfg,FILE.weights; the second may be omitted if it has the same name."""
-KINDS = ("onnx", "torchvision", "ultralytics", "torchscript", "export", "module")
+KINDS = (ONNX, ONNX_RUNTIME, HUGGING_FACE, "torchvision", "ultralytics", "torchscript", "export", "module")
 """Prefixes of detectors from elsewhere: KIND:WHAT[,MORE][,SPEC.yaml]."""
 RUNS_CODE = ("ultralytics", "torchscript", "export", "module")
 """Kinds that run code from their files when loaded."""
@@ -69,11 +80,12 @@ def load_predictor(
     """Load a detector for prediction only, or make one of a Python object.
 
     Args:
-        detector: `onnx:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts; or an object: a detector, which
-            is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); or a
+        detector: `onnx-runtime:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts; or an object: a detector,
+            which is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); a
             function from images (1, 3, H, W), RGB in [0, 1], to `boxes` (M, 4) px, `scores` (M,) and `labels` (M,)
-            in a dict, as torchvision's detectors return them.
-        device: Device of the weights; ONNX graphs run on the CPU. An object stays where it is.
+            in a dict, as torchvision's detectors return them, or to `supervision.Detections`; or a model of MAITE's
+            protocol for object detection.
+        device: Device of the weights; ONNX Runtime runs on the CPU. An object stays where it is.
         tiling: Of an ONNX graph, "auto" or "off" (see `detectors.adapters.onnx`).
         classes: Class names that the labels of a function index, or of a torch module without a `spec`.
 
@@ -87,17 +99,14 @@ def load_predictor(
         from detectors.adapters.network import adapt_object
 
         return adapt_object(detector, classes)
-    name_or_path = detector
-    name = str(name_or_path)
+    name = str(detector)
     if name.startswith(planted.PREFIX):
         fault, inner = planted.parse_planted_name(name)
         return planted.plant_fault(load_predictor(inner, device, tiling), fault)
-    if not name.startswith(ONNX):
-        return load_detector(name_or_path, device)
-    from detectors.adapters.onnx import OnnxPredictor
-
-    (file,), spec = _split_arguments("onnx", name.removeprefix(ONNX))
-    return OnnxPredictor(Path(file), tiling, spec)
+    kind, colon, rest = name.partition(":")
+    return (
+        _load_adapted(kind, rest, device, tiling) if colon and kind in KINDS else load_detector(detector, device)
+    )
 
 
 def load_detector(
@@ -116,7 +125,7 @@ def load_detector(
             detections and losses are always float32.
 
     Raises:
-        DetectorError: Unknown name, missing or damaged file, or weights of another architecture.
+        DetectorError: Unknown name, missing or damaged file, weights of another architecture, or no gradient.
     """
     disable_tf32(device)
     name = str(name_or_path)
@@ -131,7 +140,11 @@ def load_detector(
     if colon and kind in KINDS:
         if gradient_precision is not None:
             raise DetectorError(f"{name}: expected float32 for its gradients, found {gradient_precision}")
-        return _load_adapted(kind, rest).requires_grad_(False).to(device)
+        adapted = _load_adapted(kind, rest, device)
+        if not isinstance(adapted, Detector):
+            found = f"{name!r}, which has none{explain_missing_gradient(adapted)}"
+            raise DetectorError(f"detector: expected one with gradients, found {found}")
+        return adapted
     if name.startswith(DARKNET):
         from detectors.yolov3 import darknet
 
@@ -152,11 +165,29 @@ def load_detector(
     return prepare_for_inference(network, device)
 
 
-def _load_adapted(kind: str, rest: str) -> Detector:
-    """A detector from elsewhere, on the CPU."""
-    if kind == "onnx":
-        raise DetectorError(f"detector: expected one with gradients, found {f'{kind}:{rest}'!r}, which has none")
+def _load_adapted(kind: str, rest: str, device: str | torch.device, tiling: str = "auto") -> Predictor:
+    """A detector from elsewhere."""
+    disable_tf32(device)
     arguments, spec = _split_arguments(kind, rest)
+    if kind == ONNX:
+        from detectors.adapters.onnx_gradient import load_onnx
+
+        return load_onnx(Path(arguments[0]), tiling, spec, device)
+    if kind == ONNX_RUNTIME:
+        from detectors.adapters.onnx import OnnxPredictor
+
+        return OnnxPredictor(Path(arguments[0]), tiling, spec)
+    from detectors.adapters.network import require_gradient
+
+    return require_gradient(_load_network(kind, arguments, spec).requires_grad_(False).to(device))
+
+
+def _load_network(kind: str, arguments: list[str], spec: Path | None) -> Detector:
+    """A torch module from elsewhere, on the CPU."""
+    if kind == HUGGING_FACE:
+        from detectors.adapters.hugging_face import load_hugging_face
+
+        return load_hugging_face(arguments[0], spec)
     if kind == "torchvision":
         from detectors.adapters.torchvision_models import load_torchvision
 
@@ -177,6 +208,11 @@ def _load_adapted(kind: str, rest: str) -> Detector:
 
 def _split_arguments(kind: str, rest: str) -> tuple[list[str], Path | None]:
     """The comma-separated arguments after a prefix, and the YAML file if the last one is one."""
+    commas = [i for i, letter in enumerate(rest) if letter == "," and rest.endswith(_SPEC_SUFFIXES)]
+    for end in (len(rest), *commas):  # a file's name may contain commas
+        file, colon, name = rest[:end].rpartition(":") if kind == "module" else (rest[:end], ":", "file")
+        if kind != "torchvision" and colon and name.isidentifier() and Path(file).is_file():
+            return [rest[:end]], Path(rest[end + 1 :]) if end < len(rest) else None
     words = [word.strip() for word in rest.split(",")]
     spec = Path(words.pop()) if len(words) > 1 and words[-1].endswith(_SPEC_SUFFIXES) else None
     most, more = (2, "[,WEIGHTS]") if kind == "torchvision" else (1, "")

@@ -47,6 +47,8 @@ class DensePredictions:
     """One tensor per image that the gradient treats as constant (Faster R-CNN: its proposals)."""
     counts: tuple[int, ...] | None = None
     """Number of each image's own predictions, which come first; the rest is padding. None: no padding."""
+    tile_counts: tuple[tuple[int, ...], ...] = ()
+    """For each image, the number of predictions of each of its tiles, where a detector divides images."""
 
     def __post_init__(self) -> None:
         b, a, c = self.probabilities.shape
@@ -67,6 +69,7 @@ class DensePredictions:
             self.probabilities[index : index + 1, :count],
             self.image_hw,
             self.constants[index : index + 1],
+            tile_counts=self.tile_counts[index : index + 1],
         )
 
     def inject(self, box_xyxy: Tensor, label: int) -> DensePredictions:
@@ -78,7 +81,8 @@ class DensePredictions:
         boxes_xyxy[:, 0] = box_xyxy.to(boxes_xyxy)
         probabilities[:, 0, label] = 1
         counts = None if self.counts is None else tuple(max(count, 1) for count in self.counts)
-        return replace(self, boxes_xyxy=boxes_xyxy, probabilities=probabilities, counts=counts)
+        tiles = tuple((rows[0] if sum(rows) else 1, *rows[1:]) for rows in self.tile_counts)
+        return replace(self, boxes_xyxy=boxes_xyxy, probabilities=probabilities, counts=counts, tile_counts=tiles)
 
     def suppress(self, label: int, by: Tensor) -> DensePredictions:
         """A copy with the class's probabilities lowered; see `detectors.base.SuppressiblePredictions`."""

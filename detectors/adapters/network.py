@@ -32,8 +32,8 @@ from detectors.adapters.spec import (
     validate_settings,
     with_project_names,
 )
-from detectors.base import Detector, DetectorError, Predictor, describe_error
-from detectors.types import Detections
+from detectors.base import Detector, DetectorError, Predictor, describe_error, detector_device
+from detectors.types import Detections, Targets
 
 PROBE_HW = (128, 256)
 """Size of the first image for a network of any size, px: a multiple of all strides."""
@@ -75,10 +75,15 @@ class NetworkDetector(DenseDetector):
         self._settings = dict(settings)
         self._probe(names, where)
 
+    @property
+    def decoder(self) -> OutputDecoder:
+        """How its outputs are decoded."""
+        assert self._decoder is not None
+        return self._decoder
+
     def predict(self, images: Tensor) -> DensePredictions:
         """Fit each image to the network's input, run it, and map its boxes back."""
-        decoder = self._decoder
-        assert decoder is not None
+        decoder = self.decoder
         predictions = [self._predict_one(image[None], decoder) for image in images]
         counts = tuple(int(scores.shape[1]) for _, scores in predictions)
         most = max(counts)
@@ -89,10 +94,15 @@ class NetworkDetector(DenseDetector):
         return DensePredictions(boxes[:, :, None], scores, image_hw, counts=counts)
 
     def _predict_one(self, image: Tensor, decoder: OutputDecoder) -> tuple[Tensor, Tensor]:
-        network_input, placement = fit_images(image, decoder.spec)
+        spec = self.input_spec((int(image.shape[2]), int(image.shape[3])), decoder.spec)
+        network_input, placement = fit_images(image, spec)
         input_hw = int(network_input.shape[2]), int(network_input.shape[3])
         boxes, scores = decoder.decode(self._outputs(network_input, decoder.spec), input_hw)
         return placement.to_image(boxes), scores
+
+    def input_spec(self, image_hw: tuple[int, int], spec: NetworkSpec) -> NetworkSpec:
+        """The settings for an image of this size, px."""
+        return spec
 
     def _outputs(self, network_input: Tensor, spec: NetworkSpec) -> list[Tensor]:
         given: Any = normalise_images(network_input, spec)
@@ -227,6 +237,8 @@ def load_ultralytics(path: Path, spec: Path | None = None) -> NetworkDetector:
         from ultralytics import YOLO  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise DetectorError(f"{path}: needs Ultralytics: pip install 'drivesem[ultralytics]'") from None
+    except RuntimeError as error:  # a torchvision that does not fit torch
+        raise DetectorError(f"{path}: expected Ultralytics and torchvision, found {_last_line(error)}") from None
     if path.suffix != ".pt" or not path.is_file():
         raise DetectorError(f"{path}: expected a .pt file of Ultralytics, found none")
     try:
@@ -242,6 +254,49 @@ def load_ultralytics(path: Path, spec: Path | None = None) -> NetworkDetector:
         head.end2end = False
     settings = {"multiple": _ULTRALYTICS_STRIDE, "format": "yolov8"} | load_settings(path, spec)
     return NetworkDetector(path.stem, _FirstOutput(model.float().eval()), settings, names, where=str(path))
+
+
+class GradientFreePredictor:
+    """A detector of which only the detections can be used."""
+
+    gradient_obstacle = "its outputs do not depend on the image by torch's operations"
+    """Why it has no gradient."""
+
+    def __init__(self, inner: Detector) -> None:
+        self.inner = inner
+        self.name, self.classes, self.t_star = inner.name, inner.classes, inner.t_star
+
+    @torch.no_grad()
+    def forward(self, images: Tensor) -> Any:
+        """The inner detector's raw predictions."""
+        return self.inner(images)
+
+    @torch.no_grad()
+    def decode(self, raw: Any) -> list[Detections]:
+        """The inner detector's detections."""
+        return self.inner.decode(raw)
+
+
+def require_gradient(detector: Detector) -> Predictor:
+    """The detector, or a `GradientFreePredictor` if its loss has no gradient to the image, as with numpy inside.
+
+    A detector that cannot run at all is returned as it is: `detectors.check` says why.
+    """
+    device = detector_device(detector)
+    boxes = torch.tensor([[96.0, 32, 160, 96]], device=device)
+    target = Targets(boxes, torch.zeros(1, dtype=torch.int64), torch.zeros(1, dtype=torch.bool))
+    image = torch.rand(1, 3, *PROBE_HW, generator=torch.Generator().manual_seed(0)).to(device)
+    try:
+        differentiable = detector.loss(detector(image.clone().requires_grad_(True)), [target])[
+            "total"
+        ].requires_grad
+    except Exception:  # user code may raise anything; numpy refuses tensors with a gradient
+        try:
+            detector.decode(detector(image))
+            differentiable = False
+        except Exception:
+            differentiable = True
+    return detector if differentiable else GradientFreePredictor(detector)
 
 
 RAISES_NOTHING = "methods that raise nothing"
@@ -310,7 +365,7 @@ def adapt_object(instance: Any, classes: Sequence[str] | str | None = None) -> P
     settings = {} if classes is None else validate_settings({"classes": classes}, "detector")
     if isinstance(instance, nn.Module):
         name = type(instance).__name__
-        return _adapt_module(instance, f"detector {name}", name, settings).requires_grad_(False)
+        return require_gradient(_adapt_module(instance, f"detector {name}", name, settings).requires_grad_(False))
     if not callable(instance) or isinstance(instance, type):
         expected = "a name, a file, a detector, a torch.nn.Module or a function of images"
         raise DetectorError(f"detector: expected {expected}, found {type(instance).__name__} {instance!r:.80}")

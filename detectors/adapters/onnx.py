@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import importlib
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -245,7 +246,9 @@ class OnnxGraph:
         given = self._prepare(network_input, spec)
         given = given.half() if self._type is np.float16 else given
         others = {name: torch.from_numpy(array).to(given.device) for name, array in self._others.items()}
-        outputs = network(**{self._image: given}, **others)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the converter uses what torch deprecates
+            outputs = network(**{self._image: given}, **others)
         named = dict(zip(network.output_names, [outputs] if isinstance(outputs, Tensor) else outputs, strict=True))
         return self._first_of_batch([named[name] for name in self._outputs])
 

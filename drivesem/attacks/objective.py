@@ -10,7 +10,15 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from detectors.base import AnchorPredictions, Candidates, Detector, Predictor, predict, run_in_halves
+from detectors.base import (
+    AnchorPredictions,
+    Candidates,
+    Detector,
+    Predictor,
+    explain_missing_gradient,
+    predict,
+    run_in_halves,
+)
 from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.incremental.regions import Rect
 from detectors.types import Detections, Targets
@@ -300,7 +308,8 @@ class Objective:
     def differentiable(self) -> Detector:
         """The detector. Raises RangeError where it has no gradient."""
         if not isinstance(self.detector, Detector):
-            raise RangeError("detector", "one with a gradient", self.detector.name)
+            found = f"{self.detector.name}{explain_missing_gradient(self.detector)}"
+            raise RangeError("detector", "one with a gradient", found)
         return self.detector
 
     @torch.no_grad()

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from detectors import boxes
 from detectors.base import Predictor, detector_device
-from detectors.registry import ONNX
+from detectors.registry import ONNX, ONNX_RUNTIME
 from drivesem.attacks.budgets import parse_budget
 from drivesem.attacks.feasible.constraints import FeasibilityLimits
 from drivesem.attacks.feasible.projection import FeasibleSet
@@ -380,7 +380,7 @@ def build_manifest(
     """
     packages = [*_PACKAGES]
     packages += ["cma"] if config.method == "cma-es" else []
-    packages += ["onnxruntime"] if config.detector.startswith(ONNX) else []
+    packages += ["onnxruntime"] if config.detector.partition(":")[0] in (ONNX, ONNX_RUNTIME) else []
     return {
         "versions": {package: importlib.metadata.version(package) for package in packages},
         "seed": config.seed,

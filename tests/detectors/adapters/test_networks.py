@@ -2,18 +2,22 @@
 
 import re
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
-from detectors.adapters.network import NetworkDetector
-from detectors.base import DetectorError, predict
+from detectors.adapters.network import GradientFreePredictor, NetworkDetector
+from detectors.base import DetectorError, explain_missing_gradient, predict
 from detectors.check import check_detector
 from detectors.planted import PlantedDetector, PlantedFault
 from detectors.registry import load_detector, load_predictor
 from detectors.types import Targets
+from drivesem.run.probes import gradient
+from drivesem.scenes.scene import demo_scene
+from scene_ir.errors import RangeError
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "guide" / "detector.md"
 SIDE = 64
@@ -190,9 +194,38 @@ def test_invalid_class_names(place: str, message: str) -> None:
 def test_missing_library_names_the_install_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import sys
 
-    for library, name in (("torchvision", "fcos_resnet50_fpn,none"), ("ultralytics", str(tmp_path / "a.pt"))):
+    for library, name, advice in (
+        ("torchvision", "fcos_resnet50_fpn,none", "drivesem doctor"),
+        ("ultralytics", str(tmp_path / "a.pt"), r"pip install 'drivesem\[ultralytics\]'"),
+        ("transformers", str(tmp_path), r"pip install 'drivesem\[transformers\]'"),
+    ):
         for module in [m for m in sys.modules if m.split(".")[0] == library]:
             monkeypatch.delitem(sys.modules, module)
         monkeypatch.setitem(sys.modules, library, None)
-        with pytest.raises(DetectorError, match=rf"pip install 'drivesem\[{library}\]'"):
-            load_detector(f"{library}:{name}")
+        with pytest.raises(DetectorError, match=advice):
+            load_detector(f"{'hf' if library == 'transformers' else library}:{name}")
+
+
+class NumpyNetwork(TinyNetwork):
+    """The same by numpy: without a gradient."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(super().forward(torch.from_numpy(images.numpy())).detach().numpy())
+
+
+@pytest.mark.parametrize("forward", [NumpyNetwork.forward, torch.no_grad()(TinyNetwork.forward)])
+def test_a_module_without_a_gradient_is_a_predictor(forward: Callable[..., torch.Tensor]) -> None:
+    network = type("Forward", (NumpyNetwork,), {"forward": forward})()
+    network.spec = {"size": SIDE, "classes": ["Car", "bus", "person"]}
+    plain = TinyNetwork()
+    plain.spec = network.spec
+    loaded, expected = load_predictor(network), load_predictor(plain)
+    assert isinstance(loaded, GradientFreePredictor)
+    assert isinstance(expected, NetworkDetector)
+    image = torch.rand(1, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
+    found, same = predict(loaded, image)[0], predict(expected, image)[0]
+    assert len(found)
+    assert torch.equal(found.scores, same.scores)
+    assert explain_missing_gradient(loaded) == f" ({loaded.gradient_obstacle})"
+    with pytest.raises(RangeError, match=r"one with a gradient, found Forward \(its outputs do not depend"):
+        gradient(demo_scene(0), loaded)

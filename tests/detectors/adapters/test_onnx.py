@@ -223,9 +223,10 @@ def test_missing_runtime_names_the_install_command(monkeypatch: pytest.MonkeyPat
         load_predictor("onnx:own.onnx")
 
 
-def test_what_has_no_gradient_is_no_detector_to_attack() -> None:
-    with pytest.raises(DetectorError, match=r"expected one with gradients, found 'onnx:own\.onnx'"):
-        load_detector("onnx:own.onnx")
+@pytest.mark.parametrize("kind", ["onnx", "onnx-runtime"])
+def test_what_has_no_gradient_is_no_detector_to_attack(kind: str, graph: Make) -> None:
+    with pytest.raises(DetectorError, match=rf"expected one with gradients, found '{kind}:\S+', which has none"):
+        load_detector(f"{kind}:{graph(outputs({}))}")
 
 
 def test_unknown_tiling_is_refused(graph: Make) -> None:
