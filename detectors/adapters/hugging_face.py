@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from detectors.adapters.network import NetworkDetector
 from detectors.adapters.spec import MAX_SIDE, NO_CLASS, NetworkSpec, load_spec, with_project_names
@@ -85,6 +86,17 @@ def load_hugging_face(name: str, spec: Path | None = None) -> HuggingFaceDetecto
     return HuggingFaceDetector(Path(name).name, network, named | {"activation": "none"} | own, edges, where)
 
 
+class _WithoutDetach(TorchFunctionMode):
+    """Makes `Tensor.detach` do nothing. Models cut gradients between the stages of their decoder, for training: without
+    the cuts, gradients agree with differences.
+    """
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        return args[0] if func is Tensor.detach else func(*args, **(kwargs or {}))
+
+
 class _Outputs(nn.Module):
     """A model reduced to probabilities and boxes, with scores as its family computes them."""
 
@@ -94,12 +106,13 @@ class _Outputs(nn.Module):
         self.model = model
         self._softmax_columns = softmax_columns
 
-    def forward(self, images: Tensor) -> dict[str, Tensor]:
-        given = self.model(pixel_values=images)
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        with _WithoutDetach():
+            given = self.model(pixel_values=images)
         logits = given.logits
         exclusive = logits.shape[-1] == self._softmax_columns
         scores = logits.softmax(-1)[..., :-1] if exclusive else logits.sigmoid()
-        return {"logits": scores, "pred_boxes": given.pred_boxes}
+        return given.pred_boxes, scores
 
 
 def _input_settings(file: Path | None) -> tuple[dict[str, Any], tuple[int, int] | None]:
