@@ -32,8 +32,8 @@ from drivesem.config.errors import UsageError
 from drivesem.config.options import DataSourceOptions, SceneOptions, shared_options
 from drivesem.reporting.drawing import MARGIN_PX, write_picture
 from drivesem.reporting.tables import Console, print_json
+from drivesem.run.frame import detection_records
 from drivesem.run.report.pictures import draw_overlay
-from drivesem.run.results import BoxRecord
 from drivesem.scenes.sources import open_source
 from scene_ir.io import to_uint8
 
@@ -99,9 +99,7 @@ def _survey(detector: Predictor, config: CheckConfig) -> StreetDetections:
 
 def _draw(picture: Tensor, found: Detections, classes: Sequence[str], t_star: float) -> np.ndarray:
     """Draw the detections with a score of at least t* into a picture (3, H, W): (H, W, 3) uint8."""
-    rows = zip(found.boxes_xyxy.tolist(), found.labels.tolist(), found.scores.tolist(), strict=True)
-    records = tuple(BoxRecord(tuple(box), classes[label], score) for box, label, score in rows)
-    return draw_overlay(to_uint8(picture.cpu()), (), records, (), t_star)
+    return draw_overlay(to_uint8(picture.cpu()), (), detection_records(found, tuple(classes)), (), t_star)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -86,6 +86,14 @@ def test_a_network_that_finds_nothing_on_streets_fails(tmp_path: Path) -> None:
     assert cv2.imread(str(picture)).shape[1] > 1000
 
 
+def test_eval_warns_of_a_network_that_finds_nothing(small_kitti: Path, tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(MISREAD)
+    words = ("--dataset", "kitti", "--root", small_kitti, "--workers", "1")
+    captured = invoke("eval", "--detector", f"module:{path}:Misread", *words)
+    assert "Misread: no car with a score of 0.3 or more in 1 pictures" in captured.err
+
+
 def test_streets_of_a_data_set(small_kitti: Path, tmp_path: Path) -> None:
     words = ("check", "--detector", "squeezedet", "--size", "96x64", "--dataset", "kitti", "--root", small_kitti)
     captured = run_json(*words, "--limit", "1", "--out", tmp_path / "streets.jpg")
