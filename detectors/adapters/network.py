@@ -280,7 +280,7 @@ class GradientFreePredictor:
 def require_gradient(detector: Detector) -> Predictor:
     """The detector, or a `GradientFreePredictor` if its loss has no gradient to the image, as with numpy inside.
 
-    A detector that cannot run at all is returned as it is: `detectors.check` says why.
+    A detector that cannot run at all is returned as it is: `detectors.check` reports the error.
     """
     device = detector_device(detector)
     boxes = torch.tensor([[96.0, 32, 160, 96]], device=device)
@@ -292,7 +292,9 @@ def require_gradient(detector: Detector) -> Predictor:
         ].requires_grad
     except Exception:  # user code may raise anything; numpy refuses tensors with a gradient
         try:
-            detector.decode(detector(image))
+            raw = detector(image)
+            detector.decode(raw)
+            detector.loss(raw, [target])
             differentiable = False
         except Exception:
             differentiable = True
