@@ -144,6 +144,9 @@ class SceneFolder:
     def has_vehicles(self, identifier: str) -> bool:
         return len(self.scene(identifier).objects) > 0
 
+    def photograph(self, identifier: str) -> Tensor:
+        return self.scene(identifier).photograph
+
     def scene(self, identifier: str) -> SceneIR:
         return load_scene(self._folder / identifier)
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from rich.progress import track
+from torch import Tensor
 
 from detectors.registry import SHIPPED, save_detector
 from detectors.training import Sample
@@ -155,6 +156,10 @@ class FrameSubset:
     def has_vehicles(self, identifier: str) -> bool:
         """See `SceneSource`."""
         return self.source.has_vehicles(identifier)
+
+    def photograph(self, identifier: str) -> Tensor:
+        """See `SceneSource`."""
+        return self.source.photograph(identifier)
 
     def scene(self, identifier: str) -> SceneIR:
         """See `SceneSource`."""
