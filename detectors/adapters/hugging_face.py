@@ -130,7 +130,7 @@ def _input_settings(file: Path | None) -> tuple[dict[str, Any], tuple[int, int] 
         size = (
             {"shortest_edge": size, "longest_edge": facts.get("max_size", 1333)} if isinstance(size, int) else size
         )
-        settings: dict[str, Any] = {"resize": "stretch"}
+        settings: dict[str, Any] = {"resize": "stretch", "scale": 1.0, "mean": (0.0,) * 3, "std": (1.0,) * 3}
         if facts.get("do_rescale", True):
             settings["scale"] = 255 * float(facts.get("rescale_factor", 1 / 255))
         if facts.get("do_normalize", True):

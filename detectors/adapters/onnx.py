@@ -241,7 +241,7 @@ class OnnxGraph:
 
     def run_converted(self, network: Any, network_input: Tensor, spec: NetworkSpec) -> list[Tensor]:
         """`run` by the graph as a torch module of onnx2pytorch; differentiable. Whole numbers that the graph takes are
-        rounded floats here, whose gradient is that of the unrounded ones.
+        rounded floats here, with the gradient of the unrounded ones.
         """
         given = self._prepare(network_input, spec)
         given = given.half() if self._type is np.float16 else given

@@ -30,7 +30,7 @@ from detectors.types import Detections
 MAX_DIFFERENCE = 1e-3
 """Largest difference from ONNX Runtime in logits of scores; boxes may differ by 100 times as many px."""
 MAX_HALF_DIFFERENCE = 3e-2
-"""The same for graphs that compute in half precision, whose rounding differs between libraries."""
+"""The same for graphs that compute in half precision, because libraries round in different places."""
 _LEAST_PROBABILITY = 1e-3
 """Lower scores are not compared."""
 _COMPARED = 100
