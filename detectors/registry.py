@@ -81,10 +81,9 @@ def load_predictor(
 
     Args:
         detector: `onnx-runtime:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts; or an object: a detector,
-            which is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); a
+            which is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); or a
             function from images (1, 3, H, W), RGB in [0, 1], to `boxes` (M, 4) px, `scores` (M,) and `labels` (M,)
-            in a dict, as torchvision's detectors return them, or to `supervision.Detections`; or a model of MAITE's
-            protocol for object detection.
+            in a dict, as torchvision's detectors return them.
         device: Device of the weights; ONNX Runtime runs on the CPU. An object stays where it is.
         tiling: Of an ONNX graph, "auto" or "off" (see `detectors.adapters.onnx`).
         classes: Class names that the labels of a function index, or of a torch module without a `spec`.
