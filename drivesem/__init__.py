@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from detectors.registry import load_predictor as load_detector
-    from drivesem.commands.python import confirm, explain, gate, holes, report, transfer, verify
+    from drivesem.analyses import confirm, explain, gate, holes, report, transfer, verify
     from drivesem.run.counterexample import Counterexample, attack
     from drivesem.run.finished import AttackRun, load_run
     from drivesem.run.probes import Gradient, detect, gradient, margin
@@ -52,7 +52,7 @@ __version__ = "0.1.0"
 
 _NAMES_BY_MODULE = {
     "detectors.registry": ("load_detector",),
-    "drivesem.commands.python": ("confirm", "explain", "gate", "holes", "report", "transfer", "verify"),
+    "drivesem.analyses": ("confirm", "explain", "gate", "holes", "report", "transfer", "verify"),
     "drivesem.run.counterexample": ("Counterexample", "attack"),
     "drivesem.run.finished": ("AttackRun", "load_run"),
     "drivesem.run.probes": ("Gradient", "detect", "gradient", "margin"),

@@ -133,7 +133,7 @@ def test_the_signature_is_the_commands() -> None:
 
 def test_examples_in_docstrings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("scenes.scene", "run.counterexample", "run.probes", "commands.python"):
+    for name in ("scenes.scene", "run.counterexample", "run.probes", "analyses"):
         module = importlib.import_module(f"drivesem.{name}")
         assert doctest.testmod(module, raise_on_error=True).attempted > 0
         assert "```pycon\n>>> import" in (module.__doc__ or "")  # else the site shows quotations

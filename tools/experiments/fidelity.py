@@ -64,6 +64,8 @@ _LEAST_PX, _LEAST_VISIBLE, _LEAST_BOX_PX = 24.0, 0.3, 12.0
 _NEAREST_M, _TOUCH_M2 = 3.0, 0.05
 """Nearest position of an edited vehicle, and area that footprints may share."""
 _ATTEMPTS = 20
+MIN_PRECISION = 0.8
+"""Least share of rejected pictures that have a bad error, on the fitted half."""
 BAD_ERROR = 0.1
 """Error of a picture that is not to be trusted."""
 
@@ -350,12 +352,16 @@ def rank_correlation(rows: Sequence[Mapping[str, Any]], weights: Floats) -> floa
 
 
 def choose_threshold(rows: Sequence[Mapping[str, Any]], weights: Floats) -> float:
-    """The predicted error above which pictures are rejected: that with the highest F1 for errors above BAD_ERROR."""
+    """The predicted error above which pictures are rejected: the lowest at which MIN_PRECISION of the rejected ones
+    have an error above BAD_ERROR, as a rejection takes a grade away.
+    """
     evidence, error = _arrays(rows)
     predicted, bad = evidence @ weights, error > BAD_ERROR
-    candidates = np.unique(np.round(predicted, 3))
-    f1 = [2 * (bad & (predicted > t)).sum() / (bad.sum() + (predicted > t).sum()) for t in candidates]
-    return float(candidates[int(np.argmax(f1))])
+    for threshold in np.unique(np.round(predicted, 3)):
+        rejected = predicted > threshold
+        if rejected.any() and bad[rejected].mean() >= MIN_PRECISION:
+            return float(threshold)
+    return float(predicted.max())
 
 
 def run_fidelity(config: FidelityConfig) -> AnalysisReport:

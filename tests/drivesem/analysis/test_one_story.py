@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 
+from drivesem.analysis import gate
 from drivesem.failures.grades import AGREEMENT_RULE, Grade
 from drivesem.failures.kinds import OBJECT_KINDS
 from drivesem.run import attack as run_attack
 from drivesem.run import detection_cache
 from drivesem.run import folder as run_folder
 from drivesem.run.finished import load_run
-from drivesem.run.frame import has_grade
+from drivesem.run.frame import certain_losses, has_grade
 from drivesem.run.results import Failure
 from tests.drivesem.invoke import run_json
 from tests.drivesem.timid import Timid
@@ -47,6 +48,7 @@ class Story:
 def run_commands(run: Path, detectors: str = "any") -> Story:
     """Run all commands on a finished run."""
     one = ("--workers", "1", "--run", run)
+    empty = int(not any(certain_losses(frame.result) for frame in load_run(run).frames))  # nothing to compare
     return Story(
         run,
         {
@@ -57,6 +59,8 @@ def run_commands(run: Path, detectors: str = "any") -> Story:
                 "holes", run, "--workers", "1", "--samples", "24", "--fresh", "1", "--contrast", "0"
             ),
             "transfer": run_json("transfer", *one, "--detectors", detectors),
+            "gate": run_json("gate", run, "--workers", "1", "--samples", "2", "--after", detectors, code=empty),
+            "report": run_json("report", run, "--out", run / "page.html"),
         },
     )
 
@@ -74,6 +78,11 @@ def contradictions(story: Story) -> list[str]:
             check(grades[grade] == sum(has_grade(grade)(f) for _, f in story.failures), f"attack: {grade}")
     for kind, count in kinds.items():
         check(count == sum(f.error == kind for _, f in story.failures), f"attack: {kind}")
+    lost = [failure for _, failure in story.failures if failure.error in OBJECT_KINDS and is_certain(failure)]
+    check(story.answers["gate"]["failures"] == len(lost), "gate: certain failures of objects")
+    (reported,) = story.rows("report", "runs")
+    for key in ("grades", "kinds", "objects", "missed_before", "frames", "frames_not_attacked"):
+        check(reported.get(key) == story.answers["attack"].get(key), f"report: {key}")
     holes = [one for hole in story.rows("holes", "holes") for one in hole["failures"]]
     for frame, failure in story.failures:
         same = {"frame": frame, "object": failure.index, "kind": failure.error, "grade": failure.grade}
@@ -111,7 +120,7 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
     """An embedded run with a failure of each kind, all certain."""
     out, timid = tmp_path_factory.mktemp("story") / "run", Timid()
     with pytest.MonkeyPatch.context() as patch:
-        for module in (run_attack, run_folder, detection_cache):
+        for module in (run_attack, run_folder, detection_cache, gate):
             patch.setattr(module, "load_predictor", lambda *_: timid)
         words = [
             "--detector",
