@@ -45,6 +45,6 @@ run_part attack_cuda 70 "${attack[@]}" --device cuda --out "$work/attack_cuda"
 run_part attack_cpu 70 env OMP_NUM_THREADS=1 "${attack[@]}" --device cpu --out "$work/attack_cpu"
 run_part bench_render 40 "$python" -m drivesem bench render --device cuda --quick --cars 4 --triangles 2000 --json \
   --out "$work/render"
-run_part tests 90 "$python" -m pytest -q --no-header -p no:cacheprovider tests/gpu
+run_part tests 90 "$python" -m pytest -q --no-header -p no:cacheprovider -W default tests/gpu
 rm -rf "$work"
 "$python" tools/gpu_checks.py merge "$logs" "$out" && echo "$out" >&2

@@ -331,7 +331,9 @@ def merge(logs: Path, out: Path) -> None:
         part |= {"seconds": round(float(seconds), 1), "command": command}
         printed, errors = _read(logs / f"{name}.out"), _read(logs / f"{name}.err")
         try:
-            part["result"] = json.loads(printed)
+            part["result"] = json.loads(
+                printed[printed.index("{") :]
+            )  # libraries may print lines of their own first
         except ValueError:
             part["printed"] = printed.splitlines()[-_TAIL:]
         if code not in ("0", "skipped"):
