@@ -87,7 +87,7 @@ def measure_kernels(device: str) -> dict[str, Any]:
     modules = [wp.get_module(importlib.import_module(name).__name__) for name in names]
     out: dict[str, Any] = {"modules": names}
     for where in dict.fromkeys((device, "cpu")):
-        place, start, failed = str(wp.device_from_torch(torch.device(where))), time.perf_counter(), {}
+        place, start, failed = str(wp.get_device(where)), time.perf_counter(), {}
         try:
             wp.force_load(place, modules, max_workers=max(torch.get_num_threads(), 1))
         except Exception as error:  # which of them, below
