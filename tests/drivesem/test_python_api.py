@@ -326,7 +326,7 @@ def test_frames_of_a_data_set(small_kitti: Path) -> None:
     assert frames[frames.names[0]].identifier == first.identifier
     with pytest.raises(RangeError, match="frame of"):
         _ = frames["nobody"]
-    with pytest.raises(RangeError, match="dataset: expected one of coco"):
+    with pytest.raises(RangeError, match="dataset: expected one of bdd100k, coco"):
         ds.open_dataset("lego", small_kitti)
 
 

@@ -28,7 +28,7 @@ from drivesem.attack.labels import Difficulty
 from drivesem.attack.targets import HEADLINE, EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import EvalConfig
 from drivesem.config.errors import UsageError
-from drivesem.data.account import write_account
+from drivesem.data.account import write_account_of
 from drivesem.data.registry import Dataset
 from drivesem.data.subsets import FrameFilter, open_selection
 from drivesem.evaluation import coco
@@ -73,7 +73,7 @@ def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
     """Evaluate a detector on a data set, and write the results. Raises UsageError or SceneError for bad input."""
     dataset = open_selection(config.dataset, config.root or "", FrameFilter.from_options(config))
     detector = _detector(config)
-    account = write_account(dataset.account())
+    account = write_account_of(dataset, config.keep_going)
     names = dataset.identifiers[: config.limit]
     frame_detector, make_detector = _FrameDetector(config, dataset, detector), partial(_FrameDetector, config)
     jobs = run_frame_jobs(names, frame_detector, make_detector, config, ProgressSettings("frames", keep=False))
