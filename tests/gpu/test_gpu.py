@@ -52,5 +52,6 @@ def test_an_attack_equals_the_processors(tmp_path: Path) -> None:
         assert main([*words, "--out", str(tmp_path / device)]) == 0
         (path,) = (tmp_path / device).glob("frames/*/result.json")
         found.append(json.loads(path.read_text()))
-    np.testing.assert_allclose(found[1]["loss_trace"], found[0]["loss_trace"], rtol=1e-3)
+    # a sign of a derivative near 0 may differ, which one step turns into 0.1 % of the loss
+    np.testing.assert_allclose(found[1]["loss_trace"], found[0]["loss_trace"], rtol=5e-3)
     assert found[0]["success_moved"] == found[1]["success_moved"]
