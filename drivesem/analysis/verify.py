@@ -63,8 +63,8 @@ from scene_ir.types import Labels, Render, SceneIR
 
 WHOLE_RUN = "(run)"
 """Stands for the name of a frame in differences of the run as a whole."""
-_NOT_COMPUTED = ("schema", "out", "seconds", "frames_without_vehicles", "frames_failed")
-"""Keys of metrics.json that do not follow from the frames. The last two are part of its hash."""
+_NOT_COMPUTED = ("schema", "out", "seconds", "data", "frames_without_vehicles", "frames_failed")
+"""Keys of metrics.json that do not follow from the frames. The last three are part of its hash."""
 _ROUNDING = 1e-9
 
 

@@ -12,7 +12,7 @@ from drivesem.attacks.scene_edits import REMOVED, apply_edit
 from drivesem.config.commands import DerenderConfig, EditConfig, RenderConfig
 from drivesem.config.edits import ALL, merge_edits, parse_frame_edit, parse_setting, read_frame_edit
 from drivesem.config.errors import UsageError
-from drivesem.data.account import write_account
+from drivesem.data.account import write_account_of
 from drivesem.reporting.tables import Console, format_count, print_json
 from drivesem.scenes.scene import Scene, check_scene_folder
 from drivesem.scenes.sources import PhotographSource, SceneSource
@@ -109,7 +109,7 @@ def derender_command(config: DerenderConfig) -> int:
     accounts: list[dict[str, Any]] = []
 
     def print_source(source: SceneSource) -> None:
-        accounts.append(write_account(source.account()))
+        accounts.append(write_account_of(source, config.keep_going))
         _print_source(source, config, console)
 
     result = derender_frames(config, print_source)

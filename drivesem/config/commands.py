@@ -506,7 +506,7 @@ class EvalConfig(FrameFilterOptions, TileOption, WorkerOptions, CommandConfig):
     """Compute detection metrics (COCO, KITTI, VOC) for a detector or a prediction file."""
 
     gt: FolderOrUrl = None
-    """Labels: a KITTI, YOLO or Virtual KITTI folder, a COCO JSON file, or a run of drivesem attack."""
+    """Labels: a KITTI, YOLO, VOC or Virtual KITTI folder, a COCO or BDD100K JSON file, or a run of drivesem attack."""
     pred: FolderOrUrl = None
     """Detections: KITTI result files with scores, COCO results, YOLO text files, or a run."""
     pred_b: FolderOrUrl = None

@@ -12,10 +12,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from drivesem.config.errors import refuse
 from drivesem.data.classes import class_role
+from scene_ir.errors import SceneError
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 """Suffixes of images that all layouts read, in any letter case."""
@@ -123,6 +124,31 @@ def write_account(account: DataAccount | None, roles: bool = True) -> dict[str, 
         refuse(name not in account.classes, f"--map {name}", f"a class of the data set ({known})", "no such class")
     sys.stderr.write(f"{account.summarise(roles)}\n")
     return account.to_json(roles)
+
+
+class AccountedData(Protocol):
+    """Data that can be accounted for: a data set, or a source of scenes."""
+
+    def account(self) -> DataAccount | None:
+        """Account for all files and label rows; None where there is no data set."""
+        ...
+
+
+def write_account_of(data: AccountedData, keep_going: bool) -> dict[str, Any]:
+    """Account for data as `write_account` does. With `keep_going`, a damaged file is named instead of raised.
+
+    Raises:
+        SceneError: A file is damaged, and `keep_going` is not set.
+        UsageError: See `write_account`.
+    """
+    try:
+        account = data.account()
+    except SceneError as error:
+        if not keep_going:
+            raise
+        sys.stderr.write(f"files and boxes were not counted: {error}\n")
+        return {"not_counted": str(error)}
+    return write_account(account)
 
 
 def _count(number: int, noun: str, plural: str) -> str:

@@ -48,7 +48,7 @@ from drivesem.config.constraints import parse_part
 from drivesem.config.devices import check_device
 from drivesem.config.errors import UsageError
 from drivesem.config.options import FrameCommandConfig, option_name
-from drivesem.data.account import write_account
+from drivesem.data.account import write_account_of
 from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grading import Grader, make_reference_detector
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
@@ -100,7 +100,7 @@ def attack_dataset(config: AttackConfig) -> RunSummary:
     config = usable_config
     out = Path(config.out) if config.out else Path("runs") / _run_name(config, worker.params)
     claim_folder(out, config, WRITTEN)
-    account = write_account(worker.source.account())
+    account = write_account_of(worker.source, config.keep_going)
     own_mesh = None if worker.changes is None else worker.changes.mesh
     sys.stderr.writelines(f"--mesh: {note}\n" for note in (own_mesh.notes if own_mesh else ()))
     names, without_vehicles, failed = select_frames(worker.source, config)

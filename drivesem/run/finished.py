@@ -346,7 +346,7 @@ class RebuiltFrame:
 
 VOLATILE_KEYS = ("out", "seconds")
 """Keys of metrics.json and result.json that may differ between equal runs; not hashed."""
-HASHED_RUN_FIELDS = ("frames_without_vehicles", "frames_failed")
+HASHED_RUN_FIELDS = ("data", "frames_without_vehicles", "frames_failed")
 HASHED_FRAME_FIELDS = (
     *("loss_trace", "queries", "passes", "active_constraints", "violated_at_start", "became_ignored"),
     *("judged", "found_before", "failures", "grade_notes", "checked_by", "change"),

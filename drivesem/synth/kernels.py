@@ -1057,7 +1057,15 @@ def sight_kernel(
 
 
 @wp.func_native("""
-    // One row of the picture: vignette, grain, rounding. The loop is plain so that the compiler widens it.
+    // One row of the picture: vignette, grain, rounding. The loop is plain so that the compiler widens it; on the
+    // CPU only with the compiler's own functions, which CUDA lacks.
+#ifdef __CUDA_ARCH__
+    #define ROOT sqrtf
+    #define ROUND rintf
+#else
+    #define ROOT __builtin_sqrtf
+    #define ROUND __builtin_rintf
+#endif
     const float* from = (const float*)image.data + row * length;
     const float* off = (const float*)across.data;
     unsigned char* to = (unsigned char*)out.data + row * length;
@@ -1068,12 +1076,14 @@ def sight_kernel(
         float grain = ((float)(int)((pairs & 0xFFFFu) + (pairs >> 16)) - 510.0f) * scale;
         float value = from[i] * (1.0f - vignette * (off[i] + down));
         float bright = value > 0.0f ? value : 0.0f;
-        value += grain * (noise * (0.4f + __builtin_sqrtf(bright)));
+        value += grain * (noise * (0.4f + ROOT(bright)));
         value = value * 255.0f;
         value = value > 0.0f ? value : 0.0f;
         value = value < 255.0f ? value : 255.0f;
-        to[i] = (unsigned char)(int)__builtin_rintf(value);
+        to[i] = (unsigned char)(int)ROUND(value);
     }
+#undef ROOT
+#undef ROUND
 """)
 def expose_row(
     image: Floats,

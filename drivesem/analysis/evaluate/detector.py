@@ -32,7 +32,7 @@ from drivesem.attacks.labels import Difficulty
 from drivesem.attacks.targets import HEADLINE, EvaluatedClasses, resolve_t_star
 from drivesem.config.commands import EvalConfig
 from drivesem.config.errors import UsageError
-from drivesem.data.account import write_account
+from drivesem.data.account import write_account_of
 from drivesem.data.registry import Dataset
 from drivesem.data.subsets import FrameFilter, open_selection
 from drivesem.evaluation import coco
@@ -77,7 +77,7 @@ def evaluate_detector(config: EvalConfig) -> DetectorMetrics:
     """Evaluate a detector on a data set, and write the results. Raises UsageError or SceneError for bad input."""
     dataset = open_selection(config.dataset, config.root or "", FrameFilter.from_options(config))
     detector = _detector(config)
-    account = write_account(dataset.account())
+    account = write_account_of(dataset, config.keep_going)
     names = dataset.identifiers[: config.limit]
     _warn_if_blind(config, dataset, detector, names)
     frame_detector, make_detector = _FrameDetector(config, dataset, detector), partial(_FrameDetector, config)

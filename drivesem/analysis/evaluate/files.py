@@ -243,7 +243,7 @@ def _renamed(
             places[i] = out
             continue
         # letter case decides only where two classes differ by nothing else, synonyms only where names do not match
-        place = exact.get(name, index.get(name.lower(), meant.get(object_type(name))))
+        place = exact.get(name, index.get(name.lower(), meant.get(object_type(name) or "")))
         if place is None:
             if not (table.kind == i).any():
                 place = out

@@ -216,7 +216,6 @@ _COCO_DESCRIPTIONS = (
     *("AR, 1 detection", "AR, 10 detections", "AR, 100 detections", "AR, small", "AR, medium", "AR, large"),
 )
 _TEXT_COLUMNS = ("class", "metric", "what", "difficulty", "by", "part", *CONDITION_COLUMNS)
-_TEXT_COLUMNS = ("class", "metric", "what", "difficulty", "by", "part")
 """Columns of text; the others hold numbers."""
 _AXES = {"distance": "distance", "size": "height", "occlusion": "occlusion as labelled", "weather": "weather"}
 

@@ -148,6 +148,7 @@ def test_kitti_folder(kitti_folder: Path, tmp_path: Path) -> None:
     assert metrics["frames"] == 1
     assert metrics["frames_without_vehicles"] == 2
     assert list(metrics["frames_failed"]) == ["000002"]
+    assert "000002.txt:1: alpha: expected a finite number" in metrics["data"]["not_counted"]
     assert metrics["feasible_fraction"] == 1.0
     assert "000002" in (tmp_path / "run" / "report.html").read_text()
 

@@ -164,7 +164,7 @@ def test_frames_without_vehicles_are_reported(plain_coco: Path, tmp_path: Path) 
     root = shutil.copytree(plain_coco, tmp_path / "coco")
     (path,) = (root / "annotations").iterdir()
     files.write_json(path, files.read_json(path) | {"annotations": []})
-    (line,) = invoke(
+    _, line = invoke(
         *ATTACK, "--dataset", "coco", "--root", root, "--out", tmp_path / "run", code=2
     ).err.splitlines()
     assert line.endswith("found 2 frames without")
