@@ -98,9 +98,14 @@ class MinimalObjectChangeAnalyser(FailureAnalyser[MinimalObjectChange]):
         """See `FrameAnalyser.analyse`."""
         objective, theta = self.run.load_objective(self.attacker, name)
         space, problem = objective.space, objective.problem()
+
+        def fails(theta: Tensor) -> bool:
+            return not objective.evaluate(theta).correct
+
         search = MinimalChangeSearch(
             project=lambda theta: problem.project(theta).theta,
-            fails=lambda theta: not objective.evaluate(theta).correct,
+            occurs=fails,
+            fails=fails,
             size=lambda theta: float(problem.size(theta)),
             points=_POINTS,
         )
