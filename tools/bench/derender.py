@@ -285,7 +285,7 @@ def work(task: DerenderTask) -> DerenderRow:
 def _withheld(case: EditedStreet, frame: Frame, settings: DerenderSettings) -> tuple[SilhouetteOverlap, ...]:
     """Shape errors of the frame de-rendered with templates of other kinds than the vehicles'."""
     kinds = tuple(t.actor.kind for t in case.before.truths if t.labelled)
-    scene = derender(frame, replace(settings, withheld=kinds))
+    scene = derender(frame, replace(settings, withheld_kinds=kinds))
     return tuple(compare_silhouettes(case, Compositor(scene), match_tracks(scene, case.before), None))
 
 

@@ -93,7 +93,8 @@ def empty_streets(root: Path, calibrated: tuple[int, ...], count: int = 3) -> np
 @pytest.mark.slow
 def test_processes_do_not_matter(tmp_path: Path) -> None:
     root = tmp_path / "D"
-    empty_streets(root, (0, 2))
+    empty_streets(root, (0, 1, 2))
+    (root / "training" / "calib" / "000001.txt").write_text("P2: broken")
     words = ["derender", "--dataset", "kitti", "--root", str(root), "--keep-going"]
     found = {}
     for count in ("1", "2"):

@@ -48,11 +48,11 @@ def test_validation_chooses_and_held_out_frames_judge(
         runs.append((json.loads(capsys.readouterr().out)["best"], (out / "squeezedet.md").read_text()))
     (chosen, alone), (both, card) = runs
     assert both == chosen
-    assert "2 held-out frames, judged at least" in card
+    assert "2 held-out frames, evaluated from" in card
     assert "over all classes on 3 further frames," in card
-    assert "these had no say" in card
+    assert "these played no part" in card
     assert "3 held-out frames" in alone
-    assert "chosen on\nthem too" in alone
+    assert "selected on\nthem too" in alone
     again = ["train", *frames, "--validation", frames[-1], *STEPS, "--out", str(tmp_path / "again")]
     assert "also selects the weights and t*: its metrics are optimistic" in invoke(*again).err
     assert "--held-out: expected frames to judge by, beside --validation" in refusal(

@@ -102,7 +102,7 @@ def test_planted_across(
     monkeypatch.setattr(across, "CARS", 3)
     scene = build_bench_scene(1, 600).scene
     monkeypatch.setattr(across.SharedFaultBench, "_scene", lambda *_: scene)
-    monkeypatch.setattr(across_names, "SHAMS", 2)
+    monkeypatch.setattr(across_names, "CHANCE_DETECTORS", 2)
     words = [
         "planted",
         "--methods",

@@ -215,16 +215,16 @@ class ClassificationStudy:
     def _add(
         self,
         kind: str,
-        network: NetworkFeatures,
+        features: NetworkFeatures,
         strategy: str,
         views: Sequence[ObjectView],
         name: str,
         **settings: Any,
     ) -> None:
         """Add an arm; `network` among the settings is a retrained one's file."""
-        spec = settings.pop("network", network.spec)
-        config = arm_config(self.study, self.out, f"{network.name}-{name}", spec, **settings)
-        self.arms[kind, network.name, strategy] = ClassificationArm(config, tuple(views))
+        spec = settings.pop("network", features.spec)
+        config = arm_config(self.study, self.out, f"{features.name}-{name}", spec, **settings)
+        self.arms[kind, features.name, strategy] = ClassificationArm(config, tuple(views))
 
     def retrain(self) -> None:
         """Retrain networks on each method's counterexamples, and attack them anew."""
