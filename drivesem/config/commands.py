@@ -636,8 +636,7 @@ class ExportConfig(CommandConfig):
     out: NewFolder = None
     """Folder to write, new or empty."""
     to_format: Annotated[Literal[LabelFormat, "tables", "gltf", "gate"], tyro.conf.arg(aliases=["--to"])]
-    """Format: a labelled data set; tables (CSV, and Parquet with pyarrow); gltf (textured 3D scenes); gate: a small
-    package that drivesem gate takes instead of the run."""
+    """Format: a labelled data set; tables (CSV, Parquet); gltf (3D scenes); gate (a package for drivesem gate)."""
     grade: Literal["all", "threshold", "certain", "confirmed", "shared"] = "threshold"
     """Lowest grade of the failures to export; all also exports frames without failures."""
     map: ClassMap | None = None

@@ -444,9 +444,8 @@ def count_objects(results: Sequence[FrameResult]) -> dict[str, Any]:
 
     def lost(grade: Grade) -> int:
         reaches = has_grade(grade)
-        return sum(
-            f.kind == "lost" and f.index in r.found_before and reaches(f) for r in results for f in r.failures
-        )
+        lost_rows = ({f.index for f in r.failures if f.kind == "lost" and reaches(f)} for r in results)
+        return sum(len(rows & set(r.found_before)) for rows, r in zip(lost_rows, results, strict=True))
 
     return {
         "objects": VehicleCounts(sum(r.objects for r in results), judged, found),

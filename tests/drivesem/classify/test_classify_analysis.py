@@ -101,7 +101,7 @@ def test_confirm_writes_the_grade_and_the_page(run, classify, second_renderer):
     assert data["second"]["colour"]["most"] <= 1.0
     result = files.read_json(run / "frames" / NAME / "result.json")
     assert result["grade"] == "confirmed"
-    assert result["second"]["agreement"] == {"by": "twin", "before": 4, "after": 4, "draws": 4}
+    assert result["second"]["agreement"] == {"by": "twin", "before": 4, "after": 4, "draws": 4, "placebo": None}
     assert files.read_json(run / "metrics.json")["grades"]["confirmed"] == 1
     page = (run / "report.html").read_text()
     assert "rendered by twin" in page

@@ -187,7 +187,15 @@ def test_values_that_a_type_excludes_are_refused(name: str, field: str, constrai
         with pytest.raises(UsageError, match=f"^{constraint.name or flag}: expected .*, found nothing$"):
             dataclasses.replace(config, **{field: () if field == "runs" else None}).check()
     if isinstance(constraint, OnlyWith):
-        changed = {"norm": 1, "queries": 7, "step_form": "raw", "half": 1, "precision": "bfloat16", "dry": True}
+        changed = {
+            "norm": 1,
+            "queries": 7,
+            "step_form": "raw",
+            "half": 1,
+            "precision": "bfloat16",
+            "dry": True,
+            "allow_empty": True,
+        }
         value = changed.get(field, 0.5 if kind.type and "float" in str(kind.type) else ".")
         prefix = "" if constraint.field == "what" else "--method "
         unfit = {"classify": ("attack", "si-fgsm"), "runs": ("show", ""), "bench": ("render", "")}
@@ -225,8 +233,7 @@ _KEYS = {
     "attack": "json out limit seed workers device keep_going resume dataset root combo params detector method "
     "steps queries step_form rate momentum norm like budget range early_stop "
     "objective_labels objective target_objects target_classes fit backend precision t_star tiles",
-    "explain": "json out limit seed workers device keep_going resume run frame least points permutations "
-    "bootstrap",
+    "explain": "json out limit seed workers device keep_going resume run frame points permutations bootstrap",
     "confirm": "json out limit seed workers device keep_going resume run root",
     "retrain": "json out limit seed workers device keep_going resume run dataset root start fraction mix "
     "label_mode ramp validation fresh attack_steps steps minutes batch window scale rate warmup "

@@ -53,7 +53,7 @@ def test_a_run_that_is_being_made_is_no_run_that_stopped(tmp_path: Path) -> None
         assert is_locked_elsewhere(folder)
         assert f"found {folder}, into which an attack is still writing" in refusal("explain", folder)
         (folder / "frames").mkdir()
-        assert "run: 0 frames, running; combo 2 by si-fgsm" in invoke("runs", "list", tmp_path).out
+        assert "run: running, 0 frames; combo 2 by si-fgsm" in invoke("runs", "list", tmp_path).out
     assert not is_locked_elsewhere(folder)
     assert f"found {folder}, which stopped early" in refusal("explain", folder)
     acquire_folder_lock(folder)  # by this process: nobody else

@@ -55,7 +55,7 @@ def test_validation_chooses_and_held_out_frames_judge(
     assert "selected on\nthem too" in alone
     again = ["train", *frames, "--validation", frames[-1], *STEPS, "--out", str(tmp_path / "again")]
     assert "also selects the weights and t*: its metrics are optimistic" in invoke(*again).err
-    assert "--held-out: expected frames to judge by, beside --validation" in refusal(
+    assert "--held-out: expected frames to measure on, with --validation" in refusal(
         "train", *frames[:2], "--validation", validation
     )
 

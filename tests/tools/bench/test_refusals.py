@@ -39,7 +39,7 @@ from tools.bench.__main__ import main
         ("depth --device meta", "--device: expected cpu"),
         ("label-free --dataset kitti --root nowhere", "nowhere"),
         ("label-free --device meta", "--device: expected cpu"),
-        ("detector --detector onnx:graph.onnx", "--detector: expected a detector with gradients"),
+        ("detector --detector onnx:graph.onnx", "--detector: graph.onnx: expected an ONNX file"),
         ("climb --device cuda", "--device"),
         ("planted --across 4 --naming climb", "--naming: expected no --across"),
         ("planted --searched 4", "--searched: expected --across"),

@@ -30,7 +30,7 @@ REFUSALS = [
     ("retrain --benign-frames -3", "--benign-frames: expected at least 1, found -3"),
     ("retrain --held-out x", "--held-out, --benign-root: expected none with the embedded frames"),
     ("retrain --detector squeezdet", "--detector: expected a detector that can be trained"),
-    ("retrain --detector onnx:none.onnx", "--detector: expected a detector"),
+    ("retrain --detector onnx:none.onnx", "--detector: none.onnx: expected an ONNX file"),
     ("retrain --mix half", "half"),
     ("retrain --dataset kitti", "--root: expected the folder of data set 'kitti'"),
     ("plausibility", "--run: expected a folder of drivesem attack, found nothing"),

@@ -14,6 +14,7 @@ import yaml
 
 from detectors.base import AnchorPredictions, Detector
 from detectors.types import CLASSES, Detections
+from drivesem.attacks.objective import Objective
 from drivesem.run import attack as run_attack
 from drivesem.run.finished import load_runs
 from drivesem.run.results import load_frame
@@ -59,6 +60,7 @@ _scene_once = functools.cache(demo.demo_scene)
 def dazzled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: Dazzled())
     monkeypatch.setattr(demo, "demo_scene", _scene_once)
+    monkeypatch.setattr(Objective, "_count_vehicles", lambda _: ((0,), (0,)))  # something can be lost
 
 
 @pytest.mark.parametrize(
