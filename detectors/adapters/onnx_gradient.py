@@ -228,7 +228,7 @@ def _stand_in_torchvision() -> Iterator[None]:
     for name, members in _STAND_INS.items():
         module = sys.modules[name] = ModuleType(name)
         for member in members:
-            setattr(module, member, _refuse)
+            setattr(module, member, _raise_without_torchvision)
     sys.modules["torchvision"].ops = sys.modules["torchvision.ops"]  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
@@ -238,7 +238,8 @@ def _stand_in_torchvision() -> Iterator[None]:
         sys.modules.update(before)
 
 
-def _refuse(*_: Any, **__: Any) -> Any:
+def _raise_without_torchvision(*_: Any, **__: Any) -> Any:
+    """Take the place of an operator of torchvision; `_convert` names it as the operator that stands in the way."""
     raise NotImplementedError("needs a torchvision that fits this torch")
 
 

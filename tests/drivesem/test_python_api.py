@@ -392,6 +392,13 @@ def test_failures_of_earlier_runs_are_of_unknown_grade(small_run: Path) -> None:
     assert lost.to_row()["grade"] is None
 
 
+def test_a_scene_that_was_not_attacked_says_so(counterexample: ds.Counterexample) -> None:
+    result = replace(counterexample.result, failures=(), objects=3, judged=(), found_before=(), queries=0)
+    description = tags_of(replace(counterexample, result=result)._repr_html_()).text
+    assert "not attacked; feasible" in description
+    assert "none of 3 vehicles is judged" in description
+
+
 def test_names_are_escaped(counterexample: ds.Counterexample) -> None:
     named = replace(counterexample, scene=replace(counterexample.scene, name="<script>"))
     assert "<script>" not in named._repr_html_()
