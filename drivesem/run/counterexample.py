@@ -150,7 +150,9 @@ class Counterexample:
             for name, picture in (("before", before), ("after", marked))
         )
         lines = "".join(f"<li>{escape(_describe_failure(failure))}</li>" for failure in result.failures)
-        lines = lines or ("<li>no failure</li>" if result.attacked else f"<li>{escape(result.reason_not_attacked)}</li>")
+        lines = lines or (
+            "<li>no failure</li>" if result.attacked else f"<li>{escape(result.reason_not_attacked)}</li>"
+        )
         feasible = "feasible" if self.feasible else f"not feasible: {'; '.join(result.violations)}"
         grades = ", ".join(f"{count} {grade}" for grade, count in self.grades.items() if count)
         grades = grades or ("no failure" if result.attacked else "not attacked")
