@@ -239,17 +239,20 @@ def paste_unknown_objects(image: np.ndarray, classes: np.ndarray, rng: np.random
 
 def vary_light(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
     """Grain on the ground, shade from what is not in the picture; in place."""
-    sky = (classes == StreetClass.SKY)[..., None]
     ground = np.isin(classes, (StreetClass.ROAD, StreetClass.GROUND, StreetClass.GRASS, StreetClass.OTHER))[
         ..., None
     ]
     if rng.random() < 0.4:
         image *= 1 + ground * _draw(rng, 0.05, 0.3) * _smooth(rng, int(rng.integers(8, 60)))[..., None]
     if rng.random() < 0.5:
-        # the shade of trees and houses that are not in the picture
-        noise = _smooth(rng, int(rng.integers(2, 6))) + _draw(rng, 0, 0.7) * _smooth(rng, int(rng.integers(8, 40)))
-        shade = 1 / (1 + np.exp(-8 * (noise - _draw(rng, -0.5, 1))))[..., None]
-        image *= 1 - shade * (1 - sky) * _draw(rng, 0.3, 0.85)
+        cast_shade(image, classes, rng)
+
+
+def cast_shade(image: np.ndarray, classes: np.ndarray, rng: np.random.Generator) -> None:
+    """Cast the shade of trees and houses that are not in the picture; in place."""
+    noise = _smooth(rng, int(rng.integers(2, 6))) + _draw(rng, 0, 0.7) * _smooth(rng, int(rng.integers(8, 40)))
+    shade = 1 / (1 + np.exp(-8 * (noise - _draw(rng, -0.5, 1))))[..., None]
+    image *= 1 - shade * (classes != StreetClass.SKY)[..., None] * _draw(rng, 0.3, 0.85)
 
 
 def vary_camera(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
