@@ -17,10 +17,11 @@ from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, fast, reference
 from scene_ir.render.environment import PerturbedSun, apply_foliage, apply_weather, shadow_softening
+from scene_ir.render.lamps import draw_lamps
 from scene_ir.render.night import LIT, apply_night
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
 from scene_ir.render.texture import PaintRegions
-from scene_ir.types import DAYLIGHT_DIM, Crop, Objects, Render, SceneIR
+from scene_ir.types import Crop, Objects, Render, SceneIR
 
 
 def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) -> list[Render]:
@@ -133,10 +134,12 @@ class Compositor(PreparedScene):
             changed = replace(behind, weather=environment.weather.to(self.like))
             colour, inverse = canvas.split([3, 1])
             image = apply_weather(colour, inverse[0], changed, self.air, backend)
-            if is_active(environment.weather[DAYLIGHT_DIM:]):
-                lit = self.night_maps.maps[LIT]
-                lit = lit if shows is None else lit * shows
-                image = apply_night(image, inverse[0], changed, lit, self.night_maps, backend)
+            lit = self.night_maps.maps[LIT]
+            lit = lit if shows is None else lit * shows
+            lamps = torch.zeros_like(colour)
+            if len(objects):
+                lamps = draw_lamps(self.lamps, self.scene, objects, number, changed, self.centre)
+            image = apply_night(image, inverse[0], changed, lit, lamps, self.night_maps, backend)
         if weather or layers is None:
             image = blend.clamp_colour(image[:3])
         return Render(image, depth, number, opacity, drawn)

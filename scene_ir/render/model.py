@@ -219,7 +219,7 @@ HAZE_CAP_M = 300.0
 
 NIGHTFALL = 4.0
 """Rate at which the share of night grows with its code: light falls by about equal factors."""
-STREET_RGB, STREET_BASE = (0.13, 0.097, 0.067), 0.4
+STREET_RGB, STREET_BASE = (0.26, 0.19, 0.12), 0.4
 """Light of street lamps relative to daylight, after the camera's exposure, in the middle of their pools; its share
 between them.
 """
@@ -229,11 +229,11 @@ the farthest.
 """
 STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 5.0
 """Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
-GLOW_RGB = (0.0085, 0.0064, 0.0052)
+GLOW_RGB = (0.0095, 0.0070, 0.0054)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6
 """Share of the picture's height over which that glow falls by a factor e."""
-HEAD_RGB, HEAD_FAR_M = (0.34, 0.30, 0.25), 16.0
+HEAD_RGB, HEAD_FAR_M = (0.62, 0.52, 0.40), 16.0
 """Light of the own headlamps, relative to daylight, on what is near; distance at which it has fallen to half."""
 SUN_SOFTENED = 1.0
 """Compression of daylight before other light replaces it: sunlit surfaces come closer to those in the shade."""
@@ -249,16 +249,41 @@ light, as the camera opens.
 """
 LIT_HEIGHT_M = (1.0, 1.5)
 """Height above the ground from which it may be one, and is: sunlit patches on the ground are none."""
-GLARE = ((0.004, 0.5), (0.02, 0.12), (0.08, 0.03))
+GLARE = ((0.005, 0.5), (0.018, 0.3), (0.07, 0.10))
 """Glare of lamps: standard deviations, in heights of the picture, and shares of their light."""
 GLARE_FOG, GLARE_RAIN = 3.0, 1.5
 """Relative growth of glare at fog 1 and rain 1."""
 CORNER = 0.45
 """Loss of light at the picture's corners, with the lens wide open."""
-NOISE, NOISE_LEVEL = 0.003, 0.015
+NOISE, NOISE_LEVEL = 0.0025, 0.012
 """Standard deviation of the noise at black, and its growth with the display value."""
 NIGHT_BEND = 0.02
 """Display value about which the root that converts night's light to display values bends."""
+
+# --------------------------------------------------------------------------------------------------------- lamps
+
+LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0)
+"""Rates at which fog, rain, time, overcast and night make drivers switch on their lamps."""
+TAIL_LAMP_RGB, HEADLAMP_RGB = (2.2, 0.10, 0.05), (8.0, 7.2, 6.0)
+"""Light of a lamp that faces the camera by night; white is 1."""
+LAMP_BY_DAY = 0.12
+"""The same by daylight, where the exposure is shorter."""
+LAMP_RADIUS_M, LAMP_LEAST_PX = 0.065, 0.6
+"""Radius of a lamp, as the standard deviation of a Gaussian; least such width in the picture."""
+LAMP_FACES = (-0.05, 0.35)
+"""Cosine of a lamp's axis to the direction to the camera from which it shows, and shows fully."""
+HEADLAMP_WIDE = 0.06
+"""Share of a headlamp's light outside of its beam."""
+STREAK, STREAK_SHARE = (0.05, 0.0015), 0.02
+"""Widths of the streak across a lamp, in heights of the picture, and its share of the light."""
+DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH = 0.006, 0.15, 0.45
+"""Share of a lamp's light that a dry and a wet road mirror; length of that image, in distances from the lamp."""
+LAMP_SEARCH = 0.14
+"""Reach of the search for the photograph's own lamp, in widths of the vehicle."""
+TAIL_LAMP_RED, HEADLAMP_WHITE = (0.12, 0.25), (0.70, 0.85)
+"""Excess of red, and least channel, from which a pixel may be, and is, a tail lamp or a headlamp."""
+DRIVEN_ROAD = (0.35, 0.75)
+"""Share of road beyond a vehicle's outer side from which it may drive, and does."""
 
 
 def mirror_reach(height: int) -> int:

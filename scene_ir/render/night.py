@@ -80,16 +80,19 @@ def apply_night(
     inverse_depth: Tensor,
     environment: Environment,
     lit: Tensor,
+    lamps: Tensor,
     night: NightMaps,
     backend: Backend = "reference",
 ) -> Tensor:
-    """The picture (3, H, W) by night, as far as `environment.weather` has it; differentiable to all but the maps.
+    """The picture (3, H, W) by night, as far as `environment.weather` has it, with lamps on; differentiable to all but
+    the maps.
 
     Args:
         image: (3, H, W).
         inverse_depth: (H, W) 1/m, 0 in the sky.
         environment: Weather code and map of the sky.
         lit: (H, W) in [0, 1], share of each pixel that shines: the map, where nothing hides it.
+        lamps: (3, H, W), light of the vehicles' lamps.
         night: Maps of the scene.
         backend: Implementation.
     """
@@ -100,9 +103,8 @@ def apply_night(
     if backend == "warp":
         from scene_ir.render.kernels import night as kernels
 
-        return kernels.apply_night(
-            image, inverse_depth, sky, lit, torch.stack([share, growth]), maps, night.camera_m
-        )
+        settings = torch.stack([share, growth])
+        return kernels.apply_night(image, inverse_depth, sky, lit, lamps, settings, maps, night.camera_m)
     depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
     height = night.camera_m + depth * maps[RISE]
     below = torch.sigmoid((model.HEAD_CUT_M - height) / model.HEAD_SOFT_M)
@@ -110,12 +112,12 @@ def apply_night(
     head = beam / (1.0 + (depth / model.HEAD_FAR_M).square())
     colours = image.new_tensor([model.STREET_RGB, model.HEAD_RGB, (model.LIT_GAIN,) * 3, model.GLOW_RGB])
     colours = colours[..., None, None]
-    lamps = maps[STREET] * colours[0] + head * colours[1] + lit * colours[2]
+    shone = maps[STREET] * colours[0] + head * colours[1] + lit * colours[2]
     day = image.square()
     surface = day / (1.0 + model.SUN_SOFTENED * day)
-    light = surface * lamps * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:MAPS]
+    light = surface * shone * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:MAPS]
     bend = model.NIGHT_BEND**2
-    dark = image + (torch.sqrt(day + share * (light - day) + bend) - torch.sqrt(day + bend))
+    dark = image + (torch.sqrt(day + share * (light - day) + lamps + bend) - torch.sqrt(day + bend))
     seen = dark * (1.0 - share * maps[CORNER])
     return seen + share * maps[NOISE:GLARE] * (model.NOISE + model.NOISE_LEVEL * seen)
 

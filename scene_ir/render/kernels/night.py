@@ -64,6 +64,7 @@ def _night_kernel(
     inverse: Floats,
     sky: Floats,
     lit: Floats,
+    vehicles: Floats,
     maps: Floats,
     plane: int,
     out: Floats,
@@ -83,7 +84,8 @@ def _night_kernel(
         + load(sky, i) * (street * GLOW_RGB - lamps)
         + load(settings, 1) * load3(maps, GLARE * plane + i, plane)
     )
-    dark = x + (_sqrt3(day + share * (light - day) + _splat(BEND)) - _sqrt3(day + _splat(BEND)))
+    added = load3(vehicles, i, plane) + _splat(BEND)
+    dark = x + (_sqrt3(day + share * (light - day) + added) - _sqrt3(day + _splat(BEND)))
     seen = (1.0 - share * load(maps, CORNER * plane + i)) * dark
     noise = share * load3(maps, NOISE * plane + i, plane)
     store3(out, i, plane, seen + wp.cw_mul(noise, _splat(NOISE_BLACK) + NOISE_LEVEL * seen))
@@ -98,6 +100,7 @@ def _night_adjoint_kernel(
     inverse: Floats,
     sky: Floats,
     lit: Floats,
+    vehicles: Floats,
     maps: Floats,
     plane: int,
     grad: Floats,
@@ -105,7 +108,7 @@ def _night_adjoint_kernel(
     grad_maps: Floats,
     parts: Floats,
 ):
-    """grad_maps: to inverse depth, sky and lit, one plane each; parts: each pixel's part of those to the settings."""
+    """grad_maps: to inverse depth, sky, lit and the vehicles' lamps (3), one plane each; parts: each pixel's part of those to the settings."""
     i = start + wp.tid()
     share = load(settings, 0)
     x = load3(image, i, plane)
@@ -124,7 +127,9 @@ def _night_adjoint_kernel(
     lamps = wp.cw_mul(surface, colour)
     glare = load3(maps, GLARE * plane + i, plane)
     light = lamps + open_sky * (street * GLOW_RGB - lamps) + load(settings, 1) * glare
-    root, day_root = _sqrt3(day + share * (light - day) + _splat(BEND)), _sqrt3(day + _splat(BEND))
+    added = load3(vehicles, i, plane) + _splat(BEND)
+    root = _sqrt3(day + share * (light - day) + added)
+    day_root = _sqrt3(day + _splat(BEND))
     dark = x + (root - day_root)
     corner = load(maps, CORNER * plane + i)
     keep = 1.0 - share * corner
@@ -145,6 +150,7 @@ def _night_adjoint_kernel(
     g_depth = g_head * (fall * bent - cut * 2.0 * FAR * depth * fall * fall)
     store3(grad_image, i, plane, g_dark + wp.cw_mul(x, 2.0 * g_day - wp.cw_div(g_dark, day_root)))
     g_inverse = wp.where(inverse_depth >= NEAREST, -(depth * depth) * g_depth, 0.0)
+    store3(grad_maps, 3 * plane + i, plane, g_sum)
     g_sky = wp.dot(g_light, street * GLOW_RGB - lamps)
     store3(grad_maps, i, plane, wp.vec3f(g_inverse, g_sky, LIT_GAIN * (g_colour[0] + g_colour[1] + g_colour[2])))
     g_share = wp.dot(wp.cw_mul(g, noise), _splat(NOISE_BLACK) + NOISE_LEVEL * seen)
@@ -154,7 +160,9 @@ def _night_adjoint_kernel(
 
 
 class _Night(torch.autograd.Function):
-    """Night over image (3, H, W) at inverse depth (H, W); sky, lit (H, W); settings (2,); maps (11, H, W)."""
+    """Night over image (3, H, W) at inverse depth (H, W); sky, lit (H, W); lamps (3, H, W); settings (2,); maps
+    (11, H, W).
+    """
 
     @staticmethod
     def forward(
@@ -163,11 +171,12 @@ class _Night(torch.autograd.Function):
         inverse: Tensor,
         sky: Tensor,
         lit: Tensor,
+        lamps: Tensor,
         settings: Tensor,
         maps: Tensor,
         camera_m: float,
     ) -> Tensor:
-        saved = [t.detach().contiguous() for t in (settings, image, inverse, sky, lit, maps)]
+        saved = [t.detach().contiguous() for t in (settings, image, inverse, sky, lit, lamps, maps)]
         out = torch.empty_like(saved[1])
         launch(_night_kernel, split_range(inverse.numel()), [*_inputs(saved, camera_m), flat_array(out)])
         ctx.save_for_backward(*saved)
@@ -178,16 +187,17 @@ class _Night(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         image = ctx.saved_tensors[1]
+        size = image.shape[1:]
         grad_image, grad_maps, parts = (
             torch.empty_like(image),
-            torch.empty_like(image),
-            image.new_empty(2, *image.shape[1:]),
+            image.new_empty(6, *size),
+            image.new_empty(2, *size),
         )
         arrays = [flat_array(t) for t in (grad.contiguous(), grad_image, grad_maps, parts)]
         inputs = _inputs(ctx.saved_tensors, ctx.camera_m)
         launch(_night_adjoint_kernel, split_range(parts[0].numel()), [*inputs, *arrays])
         # rows first, so that sums do not depend on the number of threads
-        return grad_image, *grad_maps, parts.sum(dim=2).sum(dim=1), None, None
+        return grad_image, *grad_maps[:3], grad_maps[3:], parts.sum(dim=2).sum(dim=1), None, None
 
 
 def _inputs(saved: Any, camera_m: float) -> list[Any]:
@@ -196,14 +206,21 @@ def _inputs(saved: Any, camera_m: float) -> list[Any]:
 
 
 def apply_night(
-    image: Tensor, inverse: Tensor, sky: Tensor, lit: Tensor, settings: Tensor, maps: Tensor, camera_m: float
+    image: Tensor,
+    inverse: Tensor,
+    sky: Tensor,
+    lit: Tensor,
+    lamps: Tensor,
+    settings: Tensor,
+    maps: Tensor,
+    camera_m: float,
 ) -> Tensor:
     """See `night.apply_night`; float32.
 
     Args:
-        image, inverse, sky, lit: As there.
+        image, inverse, sky, lit, lamps: As there.
         settings: (2,), share of night and growth of glare.
         maps: (11, H, W).
         camera_m: Height of the camera, m.
     """
-    return _Night.apply(image, inverse, sky, lit, settings, maps, camera_m)
+    return _Night.apply(image, inverse, sky, lit, lamps, settings, maps, camera_m)
