@@ -192,18 +192,17 @@ def draw_lamps(
     area = radius.square()
     growth = 1.0 + model.GLARE_FOG * weather[Weather.FOG] + model.GLARE_RAIN * weather[Weather.RAIN]
     spots = [(xy, area / core.square(), core, core)]
-    for sigma, share in model.GLARE:
-        spread = torch.full_like(core, sigma * height)
-        spots.append((xy, growth * share * area / spread.square(), spread, spread))
+    for k, (sigma, share) in enumerate(model.GLARE):
+        # Drops scatter wider than the lens.
+        spread = (core.square() + (sigma * height) ** 2).sqrt()
+        spots.append((xy, (growth if k else 1.0) * share * area / spread.square(), spread, spread))
     across, along = model.STREAK
     streak = model.STREAK_SHARE * area / (across * along * height**2)
     spots.append((xy, streak, torch.full_like(core, across * height), torch.full_like(core, along * height)))
     light = _splat(spots, colours, height, width)
     wet = model.DRY_MIRROR + (model.WET_MIRROR - model.DRY_MIRROR) * weather[Weather.RAIN]
     drop = (mirror_xy[:, 1] - xy[:, 1]).clamp(min=1.0)
-    mirrored = [
-        (mirror_xy, torch.ones_like(core) * area / core.square(), 1.5 * core, model.MIRROR_LENGTH * drop + core)
-    ]
+    mirrored = [(mirror_xy, area / core.square(), 1.5 * core, model.MIRROR_LENGTH * drop + core)]
     road = environment.road.to(centre)
     return light + wet * road * _splat(mirrored, colours, height, width)
 

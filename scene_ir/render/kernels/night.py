@@ -108,7 +108,9 @@ def _night_adjoint_kernel(
     grad_maps: Floats,
     parts: Floats,
 ):
-    """grad_maps: to inverse depth, sky, lit and the vehicles' lamps (3), one plane each; parts: each pixel's part of those to the settings."""
+    """grad_maps: to inverse depth, sky, lit and the vehicles' lamps (3), one plane each; parts: each pixel's part of
+    those to the settings.
+    """
     i = start + wp.tid()
     share = load(settings, 0)
     x = load3(image, i, plane)
