@@ -16,9 +16,10 @@ from torch import Tensor
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, fast, reference
+from scene_ir.render.channels import LIT
 from scene_ir.render.environment import PerturbedSun, apply_foliage, apply_weather, shadow_softening
 from scene_ir.render.lamps import draw_lamps
-from scene_ir.render.night import LIT, apply_night
+from scene_ir.render.night import apply_night
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
 from scene_ir.render.texture import PaintRegions
 from scene_ir.types import Crop, Objects, Render, SceneIR

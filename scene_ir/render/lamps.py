@@ -20,7 +20,7 @@ from scene_ir.geometry import to_clip
 from scene_ir.render import model
 from scene_ir.render.surfaces import rotate_y
 from scene_ir.render.texture import smoothstep
-from scene_ir.types import Environment, Mesh, Objects, Part, SceneIR, Weather
+from scene_ir.types import Crop, Environment, Mesh, Objects, Part, SceneIR, Weather
 
 _QUADRANTS = tuple(product((1.0, -1.0), (1.0, -1.0)))
 """Signs of x (front) and z (left) of the four lamps."""
@@ -67,8 +67,9 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     focal = scene.camera.matrix[0, 0].to(like)
     reach_px = model.LAMP_SEARCH * focal * base.size_lhw[:, 2:].to(like) / depth
     shift_px = torch.zeros_like(xy)
-    for i, k in ((facing > 0.2) & (depth > 0.5)).nonzero().tolist():
-        shift_px[i, k] = _snap(scene.photograph, xy[i, k], max(float(reach_px[i, k]), _LEAST_SEARCH_PX), k < 2)
+    for i, k in ((facing > 0.2) & (depth > 0.5)).nonzero().tolist() if base.source else ():
+        reach = max(float(reach_px[i, k]), _LEAST_SEARCH_PX)
+        shift_px[i, k] = _snap(base.source[i].foreground, xy[i, k], reach, k < 2)
     return VehicleLamps(unit, weights, shift_px * (depth / focal)[..., None], driven)
 
 
@@ -108,16 +109,17 @@ def _is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
     return smoothstep(road, *model.DRIVEN_ROAD)
 
 
-def _snap(photograph: Tensor, xy: Tensor, reach_px: float, front: bool) -> Tensor:
+def _snap(foreground: Crop, xy: Tensor, reach_px: float, front: bool) -> Tensor:
     """Shift (2,) px from a lamp's projection to the photograph's lamp: red pixels behind, bright ones in front; 0
-    where there are none.
+    where there are none. foreground: of the vehicle's `Source`.
     """
-    height, width = photograph.shape[1:]
+    xy = xy - xy.new_tensor([foreground.x0, foreground.y0])
+    height, width = foreground.values.shape[1:]
     (x0, y0), (x1, y1) = (xy - reach_px).floor().long().tolist(), (xy + reach_px).ceil().long().tolist()
     x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1 + 1, width), min(y1 + 1, height)
     if x1 <= x0 or y1 <= y0:
         return torch.zeros_like(xy)
-    red, green, blue = photograph[:, y0:y1, x0:x1].to(xy)
+    red, green, blue, _ = foreground.values[:, y0:y1, x0:x1].to(xy)
     strength = torch.minimum(torch.minimum(red, green), blue) if front else red - torch.maximum(green, blue)
     strength = smoothstep(strength, *(model.HEADLAMP_WHITE if front else model.TAIL_LAMP_RED))
     rows, columns = torch.meshgrid(torch.arange(y0, y1).to(xy), torch.arange(x0, x1).to(xy), indexing="ij")

@@ -21,10 +21,8 @@ from torch import Tensor
 from scene_ir.geometry import height_above_ground
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
+from scene_ir.render.channels import AIM, CORNER, GLARE, NIGHT_MAPS, NOISE, RISE, STREET
 from scene_ir.types import Environment, SceneIR, Weather
-
-RISE, AIM, STREET, LIT, CORNER, NOISE, GLARE, MAPS = 0, 1, 2, 3, 4, 5, 8, 11
-"""First map of each quantity of `NightMaps.maps`, and their count."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +113,7 @@ def apply_night(
     shone = maps[STREET] * colours[0] + head * colours[1] + lit * colours[2]
     day = image.square()
     surface = day / (1.0 + model.SUN_SOFTENED * day)
-    light = surface * shone * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:MAPS]
+    light = surface * shone * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:NIGHT_MAPS]
     bend = model.NIGHT_BEND**2
     dark = image + (torch.sqrt(day + share * (light - day) + lamps + bend) - torch.sqrt(day + bend))
     seen = dark * (1.0 - share * maps[CORNER])
@@ -130,7 +128,7 @@ def _signs(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
 
 def _lit_share(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
     """How far (H, W) a pixel of the background (H, W, 3) shines: small and brighter than all around, as lamps and
-    windows are; not next to the sky, whose light comes through leaves and wires.
+    windows are; not next to the sky, as its light comes through leaves and wires.
     """
     size = max(3, rgb.shape[0] // 24) | 1
     value = rgb.max(axis=2)

@@ -13,8 +13,8 @@ from torch.autograd.function import once_differentiable
 from scene_ir.raster.launch import Floats, launch, split_range, start_warp
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, store, store3
 from scene_ir.render import model
+from scene_ir.render.channels import AIM, CORNER, GLARE, NOISE, RISE, STREET
 from scene_ir.render.kernels.colour import flat_array
-from scene_ir.render.night import AIM, CORNER, GLARE, NOISE, RISE, STREET
 
 start_warp()
 wp.set_module_options(SIMD_OPTIONS)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from scene_ir.render import night
+from scene_ir.render import channels, night
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import WEATHER_DIM, Environment, SceneIR, Weather
@@ -117,10 +117,10 @@ def test_headlamps_light_what_is_near_ahead_and_below_their_cut() -> None:
     # near and far on the road, near above the cut-off, near and far aside
     inverse = torch.tensor([[1 / 8, 1 / 60, 1 / 8, 1 / 8]], dtype=torch.float64)
     planes = torch.zeros_like(maps.maps)
-    planes[night.RISE] = -1.6 * inverse
-    planes[night.RISE, 0, 2] = 0.3
-    planes[night.AIM] = torch.tensor([[1.0, 1.0, 1.0, 0.1]])
-    planes[night.STREET] = 0.1
+    planes[channels.RISE] = -1.6 * inverse
+    planes[channels.RISE, 0, 2] = 0.3
+    planes[channels.AIM] = torch.tensor([[1.0, 1.0, 1.0, 0.1]])
+    planes[channels.STREET] = 0.1
     blank = torch.zeros_like(inverse)
     code = torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     out = _apply([image, inverse, blank, blank, torch.zeros_like(image)], code, night.NightMaps(planes, 1.6))
@@ -145,13 +145,13 @@ def test_maps_know_the_ground_and_the_own_lane(photographed: SceneIR) -> None:
     found = night.compute_night_maps(photographed)
     maps = found.maps
     height, width = photographed.depth.shape
-    assert tuple(maps.shape) == (night.MAPS, height, width)
+    assert tuple(maps.shape) == (channels.NIGHT_MAPS, height, width)
     road = photographed.environment.road > 0.5
-    above = found.camera_m + photographed.depth * maps[night.RISE]
+    above = found.camera_m + photographed.depth * maps[channels.RISE]
     assert float(above[road].abs().max()) < 0.05
-    assert float(maps[night.AIM, -1, width // 2]) > float(maps[night.AIM, -1, 0])
-    assert float(maps[night.CORNER, 0, 0]) > float(maps[night.CORNER, height // 2, width // 2])
-    assert float(maps[night.NOISE : night.GLARE].std()) == pytest.approx(1.0, abs=0.05)
+    assert float(maps[channels.AIM, -1, width // 2]) > float(maps[channels.AIM, -1, 0])
+    assert float(maps[channels.CORNER, 0, 0]) > float(maps[channels.CORNER, height // 2, width // 2])
+    assert float(maps[channels.NOISE : channels.GLARE].std()) == pytest.approx(1.0, abs=0.05)
 
 
 def test_glare_grows_with_fog(check_code_gradient: Callable[[Callable[[Tensor], Tensor], Tensor], None]) -> None:
