@@ -22,12 +22,25 @@ LATTICE = (4, 4, 4)
 LATTICE_POINTS = LATTICE[0] * LATTICE[1] * LATTICE[2]
 TEXTURE_DIM = 5
 """Texture code: lightness, a*, b*, gloss, dirt."""
-WEATHER_DIM = 4
-"""Weather code: fog, rain, time of day, overcast."""
 LIGHT_DIM = 3
 """Light code: the sun's azimuth (to the right), elevation (up), strength."""
 FOLIAGE_DIM = 3
 """Foliage code: hue (season), lightness, density."""
+
+
+class Weather(IntEnum):
+    """Codes of `Environment.weather` by index; each in [0, 1], and 0 as photographed."""
+
+    FOG = 0
+    RAIN = 1
+    TIME = 2
+    OVERCAST = 3
+    NIGHT = 4
+
+
+WEATHER_DIM = len(Weather)
+DAYLIGHT_DIM = int(Weather.NIGHT)
+"""Codes before `NIGHT`: the paper's, and those of scenes saved before there was a night."""
 
 
 class Part(IntEnum):
@@ -289,7 +302,7 @@ class Environment:
     """Codes and maps of the surroundings."""
 
     weather: Tensor
-    """(4,) in [0, 1]; 0 is as photographed."""
+    """(5,) in [0, 1], see `Weather`; 0 is as photographed. (4,), the codes of daylight, is night 0."""
     foliage: Tensor
     """(3,) in [-1, 1]; 0 is as photographed."""
     sun: Tensor
@@ -306,6 +319,9 @@ class Environment:
     """(3,) in [-1, 1]; 0 is as photographed."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.weather, Tensor) and self.weather.shape == (DAYLIGHT_DIM,):
+            weather = torch.nn.functional.pad(self.weather, (0, WEATHER_DIM - DAYLIGHT_DIM))
+            object.__setattr__(self, "weather", weather)
         check_shape("environment.weather", self.weather, WEATHER_DIM)
         check_shape("environment.foliage", self.foliage, FOLIAGE_DIM)
         check_shape("environment.light", self.light, LIGHT_DIM)

@@ -66,6 +66,7 @@ FEATURE_TEXT = {
     "weather.rain": "rain, 0 none to 1 strong: {}",
     "weather.time_of_day": "time, 0 as photographed to 1 twilight: {}",
     "weather.overcast": "sky, 0 as photographed to 1 overcast: {}",
+    "weather.night": "night, 0 as photographed to 1 street lamps only: {}",
     "foliage.hue": "leaves, hue from -1 to 1: {}",
     "foliage.lightness": "leaves, -1 darker to 1 lighter: {}",
     "foliage.density": "leaves, -1 sparser to 1 denser: {}",

@@ -33,7 +33,7 @@ from scene_ir.render.kernels.colour import (
     rgb_to_lab_adjoint,
     scale_odds,
 )
-from scene_ir.types import Environment
+from scene_ir.types import DAYLIGHT_DIM, Environment
 
 start_warp()
 wp.set_module_options(SIMD_OPTIONS)
@@ -909,8 +909,8 @@ def apply_weather(
         streaks: (H, W) in [0, 1].
     """
     code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
-    fog, rain, _, overcast = code
-    code = torch.cat([code, low_sun_share(fog, rain, overcast)[None]])
+    fog, rain, time, overcast = code[:DAYLIGHT_DIM]
+    code = torch.stack([fog, rain, time, overcast, low_sun_share(fog, rain, overcast)])
     return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
 
 

@@ -153,7 +153,7 @@ def test_a_street_is_longer_along_than_across(street):
     assert along_m == pytest.approx([float(away_m[0]), float(away_m[1]), budget.translate * 1.6, 4.0])
     assert across_m == pytest.approx([1.0] * 4)
     # All else goes as far as the paper's.
-    papers = ParameterSpace(scene, PAPER_PARAMETERS)
+    papers = ParameterSpace(scene, PAPER_PARAMETERS, Budget(night=1.0))
     size = space.blocks.get(Parameter.SIZE)
     assert space.upper[size].tolist() == pytest.approx([0.1] * 4)
     assert space.upper[size.stop :].tolist() == [1.0] * 3  # the sun's

@@ -12,7 +12,7 @@ import torch
 
 from drivesem.attacks.feasibility_check import check_places
 from drivesem.attacks.scene_edits import apply_changes, apply_edit
-from drivesem.attacks.space import ParameterSpace, Perturbation
+from drivesem.attacks.space import Budget, ParameterSpace, Perturbation
 from drivesem.config.edits import (
     ALL,
     WEATHER_CODES,
@@ -60,8 +60,10 @@ def test_settings_of_objects(text: str, expected: dict[int | str, ObjectEdit]) -
 
 def test_settings_of_the_scene() -> None:
     assert edit_of("weather.rain=0.4", "foliage.hue=-0.5") == FrameEdit(
-        weather=(0.0, 0.4, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
+        weather=(0.0, 0.4, 0.0, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
     )
+    assert edit_of("weather=fog=0.6,night=1").weather == (0.6, 0.0, 0.0, 0.0, 1.0)
+    assert edit_of("weather.rain=0.4", "weather=fog=0.6").weather == (0.6, 0.0, 0.0, 0.0, 0.0)
     for name, codes in WEATHER_PRESETS.items():
         assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_CODES)
 
@@ -138,7 +140,14 @@ def test_bare_numbers_of_a_file_are_in_units_of_theta() -> None:
         ("objects[2].remove=yes", "remove: expected true or false, found 'yes'"),
         ("objects[-1].rotate=1deg", "objects: expected a number from 0, or all, found '-1'"),
         ("objects[two].rotate=1deg", "objects: expected a number from 0, or all, found 'two'"),
-        ("weather=snow", "weather: expected codes, or one of fog, rain, sunset, overcast, twilight, found 'snow'"),
+        (
+            "weather=snow",
+            "weather: expected codes such as fog=0.6,night=1, or one of fog, rain, sunset, overcast, twilight, night, "
+            "found 'snow'",
+        ),
+        ("weather=snow=1", "weather: snow: expected one of fog, rain, time, overcast, night"),
+        ("weather=night=2", r"weather.night: expected a code in \[0, 1\], found 2.0"),
+        ("weather=fog=0.5,night", "weather: expected codes such as"),
         ("weather.snow=1", "weather: snow: expected one of fog, rain, time, overcast"),
         ("weather.fog=2", r"weather.fog: expected a code in \[0, 1\], found 2.0"),
         ("foliage=autumn", "an unknown parameter"),
@@ -197,9 +206,10 @@ def test_it_moves_as_theta_does(street: Street) -> None:
 
     change = Perturbation(
         color=rows(count, 5), translate=rows(count, 2), rotate=rows(count, 1), mesh=rows(count, SYMMETRIC_DIM),
-        weather=rows(4).abs(), foliage=rows(3),
+        weather=rows(5).abs(), foliage=rows(3),
     )  # fmt: skip
-    space = ParameterSpace(scene, ["color", "weather", "foliage", "translate", "rotate", "mesh"])
+    params = ["color", "weather", "foliage", "translate", "rotate", "mesh"]
+    space = ParameterSpace(scene, params, Budget(night=1.0))
     expected = space.apply(scene, space.flatten(change))
     assert change.translate is not None
     assert change.rotate is not None
@@ -230,7 +240,7 @@ def test_all_and_one_add_up_and_codes_end_at_their_bounds(street: Street) -> Non
     turned = torch.rad2deg(after.objects.yaw - scene.objects.yaw)
     torch.testing.assert_close(turned, torch.tensor([1.0, 1.0, 3.0, 1.0]), atol=1e-4, rtol=0)
     foggy = apply_changes(apply_changes(scene, edit_of("weather.fog=0.8")), edit_of("weather.fog=0.8"))
-    assert foggy.environment.weather.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert foggy.environment.weather.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_no_change_keeps_every_bit(street: Street) -> None:
@@ -238,7 +248,7 @@ def test_no_change_keeps_every_bit(street: Street) -> None:
     after = apply_changes(scene, edit_of("objects[all].rotate=0deg"))
     assert torch.equal(after.objects.translation, scene.objects.translation)
     assert torch.equal(after.objects.yaw, scene.objects.yaw)
-    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0))).environment.weather[0] == 1
+    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0, 0))).environment.weather[0] == 1
 
 
 def test_removal_names_rows(street: Street) -> None:
