@@ -55,6 +55,7 @@ VERSION = 4
 _T = TypeVar("_T")
 _DTYPES = {str(d).removeprefix("torch."): d for d in (torch.float32, torch.float64, torch.int64, torch.int32)}
 _MAPS = ("sky", "foliage_map", "road")
+_CLOSED_SKY = "closed_sky"
 _IMAGES = ("photograph", "background")
 _OBJECT_FIELDS: dict[str, tuple[int, ...]] = {
     "mesh_index": (),
@@ -116,6 +117,8 @@ def save_scene(scene: SceneIR, folder: Path, lossy: bool = False) -> None:
     with files.atomic_folder(Path(folder)) as temporary:
         arrays = {"depth": _array(scene.depth)}
         arrays |= {name: _array(getattr(scene.environment, name)) for name in _MAPS}
+        if scene.environment.closed_sky is not None:
+            arrays[_CLOSED_SKY] = _array(scene.environment.closed_sky)
         in_png = {}
         for name in _IMAGES:
             image = getattr(scene, name).detach().cpu()
@@ -198,6 +201,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
                 for name, width in _ENVIRONMENT_FIELDS.items()
             },
             **{name: arrays.tensor(name, *size) for name in _MAPS},
+            closed_sky=arrays.tensor(_CLOSED_SKY, 3, None, None) if _CLOSED_SKY in arrays else None,
         )
     )
     meshes = tuple(_load_mesh(folder / "meshes" / f"{i}.glb") for i in range(root["meshes"].integer()))

@@ -317,6 +317,9 @@ class Environment:
     """(H, W) in [0, 1], share of road."""
     light: Tensor = field(default_factory=lambda: torch.zeros(LIGHT_DIM))
     """(3,) in [-1, 1]; 0 is as photographed."""
+    closed_sky: Tensor | None = None
+    """(3, h, w) in [0, 1], the background under a closed sky as codes of its ratio to the photographed one:
+    exp((2 code - 1) `render.model.CLOSED_SKY_LOG`); None for what is not known."""
 
     def __post_init__(self) -> None:
         if isinstance(self.weather, Tensor) and self.weather.shape == (DAYLIGHT_DIM,):
@@ -330,6 +333,8 @@ class Environment:
         check_shape("environment.sky", self.sky, None, None)
         check_shape("environment.foliage_map", self.foliage_map, *self.sky.shape)
         check_shape("environment.road", self.road, *self.sky.shape)
+        if self.closed_sky is not None:
+            check_shape("environment.closed_sky", self.closed_sky, 3, None, None)
         for name in ("weather", "foliage", "light", "sun", "ground"):
             check_finite(f"environment.{name}", getattr(self, name))
 

@@ -52,8 +52,11 @@ from scene_ir.derender import delight, unet
 from scene_ir.derender import segmentation as segment
 from scene_ir.derender.delight import DelightNet
 from scene_ir.derender.segmentation import StreetClass
+from scene_ir.render.environment import compute_closed_sky_gain
+from scene_ir.render.model import CLOSED_SKY_LOG, CLOSED_SKY_OFFSET
+from scene_ir.types import Weather
 
-CLOSED = FrameEdit(weather=(0.0, 0.0, 0.0, 1.0))
+CLOSED = FrameEdit(weather=tuple(float(code is Weather.OVERCAST) for code in Weather))
 """The edit that closes the sky."""
 CLOUDED_SHARE = 0.2
 """Share of training examples that are under clouds already, and must not change."""
@@ -171,8 +174,8 @@ def build_batch(store: PairStore, step: int, settings: DelightSettings) -> tuple
 
 def true_log_ratio(image: Tensor, clouded: Tensor) -> Tensor:
     """Bounded logarithm (N, 3, h/2, w/2) of the ratio of two pictures (N, 3, h, w)."""
-    low, high = (F.avg_pool2d(picture, 2) + delight.OFFSET for picture in (image, clouded))
-    return (high / low).log().clamp(-delight.MAX_LOG_RATIO, delight.MAX_LOG_RATIO)
+    low, high = (F.avg_pool2d(picture, 2) + CLOSED_SKY_OFFSET for picture in (image, clouded))
+    return (high / low).log().clamp(-CLOSED_SKY_LOG, CLOSED_SKY_LOG)
 
 
 def compute_loss(found: Tensor, true: Tensor, sky: Tensor, gradient: float) -> Tensor:
@@ -209,8 +212,9 @@ class DelightRun(AveragedRun[DelightNet]):
             images, clouded, elevation, sky = build_batch(store, step, settings)
             warm = min(1.0, (step + 1) / 50)
             with torch.autocast("cpu", torch.bfloat16):
-                found = self.network(images, elevation)
-            loss = compute_loss(found.float(), true_log_ratio(images, clouded), sky, settings.gradient)
+                logits = self.network(images, elevation)
+            found = CLOSED_SKY_LOG * torch.tanh(logits.float() / 2)
+            loss = compute_loss(found, true_log_ratio(images, clouded), sky, settings.gradient)
             self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
         return float(loss.detach())
 
@@ -229,9 +233,11 @@ def judge(network: DelightNet, pairs: Sequence[tuple[SynthFrame, SynthFrame]]) -
         true = clouded.image.astype(np.float32) / 255
         region = sunny.environment.sky.numpy() < 0.5
         for name, frame in (("sun", sunny), ("clouds", clouded)):
-            image = frame.image.astype(np.float32) / 255
-            ratio = delight.estimate_closed_sky(image, frame.environment.ground, frame.camera, network)
-            estimate = np.clip(image * np.exp(ratio), 0, 1)
+            image, environment = frame.image.astype(np.float32) / 255, frame.environment
+            closed_sky = delight.estimate_closed_sky(image, environment.ground, frame.camera, network)
+            background, focal_px = torch.from_numpy(image).permute(2, 0, 1), float(frame.camera.intrinsics[0, 0])
+            gain = compute_closed_sky_gain(closed_sky, background, environment.sky, focal_px)
+            estimate = (background * (1 + gain)).clamp(0, 1).permute(1, 2, 0).numpy()
             found.setdefault(name, []).append((psnr_db(image, true, region), psnr_db(estimate, true, region)))
     return {name: (float(np.mean(rows, 0)[0]), float(np.mean(rows, 0)[1])) for name, rows in found.items()}
 
@@ -304,7 +310,7 @@ def main() -> None:
     card = CARD.format(
         parameters=sum(p.numel() for p in network.parameters()),
         focal=unet.INPUT_FOCAL_PX,
-        bound=delight.MAX_LOG_RATIO,
+        bound=CLOSED_SKY_LOG,
         file=arguments.out.name,
         frames=settings.frames,
         version=GENERATOR_VERSION,

@@ -1,14 +1,12 @@
-"""Light of a closed sky: by how much each pixel of a photograph would change if clouds covered the sun.
+"""Light of a closed sky: how a photograph would change if clouds covered the sun, at a lower resolution.
 
-A network estimates the logarithm of the ratio of both pictures at a lower resolution. A guided filter (He et al., ECCV
-2010) moves its steps to the photograph's edges, where cast shadows end.
+`render.environment.compute_closed_sky_gain` brings the result to the photograph's resolution and edges.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -21,24 +19,14 @@ from scene_ir.weights import SHIPPED_WEIGHTS, load_frozen
 Array = NDArray[np.float32]
 
 WEIGHTS = SHIPPED_WEIGHTS / "delight.safetensors"
-MAX_LOG_RATIO = 1.5
-"""Bound of the logarithm: no pixel becomes more than 4.5 times as bright, or as dark."""
-OFFSET = 0.02
-"""Added to both pictures before their ratio is taken: black has no ratio."""
-_GUIDE_RADIUS = 0.02
-"""Radius of the guided filter, as a share of the focal length."""
-_GUIDE_EPSILON = 2e-3
-"""Variance of the guide, the photograph's logarithm, from which an edge is one."""
 
 
 class DelightNet(unet.UNet):
-    """RGB (N, 3, h, w) in [0, 1] and elevation (N, 1, h, w), sides multiples of 16 -> log ratio (N, 3, h/2, w/2)."""
+    """RGB (N, 3, h, w) in [0, 1] and elevation (N, 1, h, w), sides multiples of 16 -> logits (N, 3, h/2, w/2) of
+    `Environment.closed_sky`."""
 
     def __init__(self) -> None:
         super().__init__(3)
-
-    def forward(self, image: Tensor, elevation: Tensor) -> Tensor:
-        return MAX_LOG_RATIO * torch.tanh(super().forward(image, elevation))
 
 
 @lru_cache(maxsize=1)
@@ -47,9 +35,7 @@ def load_network() -> DelightNet:
     return load_frozen(DelightNet(), WEIGHTS)
 
 
-def estimate_closed_sky(
-    image: Array, ground: Tensor, camera: Camera, network: DelightNet | None = None
-) -> Array:
+def estimate_closed_sky(image: Array, ground: Tensor, camera: Camera, network: DelightNet | None = None) -> Tensor:
     """Estimate how a photograph would change if clouds covered the sun.
 
     Args:
@@ -59,14 +45,7 @@ def estimate_closed_sky(
         network: In place of the shipped one.
 
     Returns:
-        Logarithm (H, W, 3) of the ratio of the picture under a closed sky to the photograph, within `MAX_LOG_RATIO`;
-        0 changes no pixel.
+        `Environment.closed_sky`, (3, h, w), multiples of 1 / 255.
     """
-    height, width = image.shape[:2]
-    view = unet.prepare_input(image, ground, camera)
-    coarse = (network or load_network()).predict(view)[0].permute(1, 2, 0).numpy()
-    large = np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
-    guide = np.log(image + np.float32(OFFSET))
-    radius = max(2, round(_GUIDE_RADIUS * float(camera.intrinsics[0, 0])))
-    sharp = cv2.ximgproc.guidedFilter(guide, large, radius, _GUIDE_EPSILON)
-    return np.clip(sharp, -MAX_LOG_RATIO, MAX_LOG_RATIO).astype(np.float32)
+    logits = (network or load_network()).predict(unet.prepare_input(image, ground, camera))[0]
+    return (torch.sigmoid(logits) * 255).round() / 255

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scene_ir.derender import alignment as icp
 from scene_ir.derender import alignment as template_choice
-from scene_ir.derender import cutout, depth, occluders, paint_mask, segmentation, shadow, silhouette
+from scene_ir.derender import cutout, delight, depth, occluders, paint_mask, segmentation, shadow, silhouette
 from scene_ir.derender import depth as ground_geometry
 from scene_ir.derender import matte as mask_extension
 from scene_ir.derender.background_fill import BackgroundFill, BackgroundInputs
@@ -187,7 +187,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         camera,
         meshes,
         objects,
-        _make_environment(maps, ground, sun, vehicles),
+        _make_environment(maps, ground, sun, vehicles, delight.estimate_closed_sky(background, ground, camera)),
         frame.photograph.float(),
         torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1))),
         depth_m,
@@ -659,7 +659,11 @@ def _min_background_depth(cuts: list[_VehicleCutout], camera: Camera) -> Array:
 
 
 def _make_environment(
-    maps: segmentation.Segmentation, ground: torch.Tensor, sun: torch.Tensor, vehicles: Mask
+    maps: segmentation.Segmentation,
+    ground: torch.Tensor,
+    sun: torch.Tensor,
+    vehicles: Mask,
+    closed_sky: torch.Tensor,
 ) -> Environment:
     """The background's maps, with codes 0."""
     # Weather changes the finished picture, so a vehicle in front of the sky is not sky. Foliage changes before the
@@ -671,6 +675,7 @@ def _make_environment(
         sun,
         ground,
         *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, maps.foliage, maps.road)),
+        closed_sky=closed_sky,
     )
 
 

@@ -17,7 +17,13 @@ from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, fast, reference
 from scene_ir.render.channels import LIT
-from scene_ir.render.environment import PerturbedSun, apply_foliage, apply_weather, shadow_softening
+from scene_ir.render.environment import (
+    PerturbedSun,
+    apply_foliage,
+    apply_weather,
+    shadow_softening,
+    sunlight_share,
+)
 from scene_ir.render.lamps import draw_lamps
 from scene_ir.render.night import apply_night
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
@@ -87,8 +93,13 @@ class Compositor(PreparedScene):
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))
             canvas = torch.cat([apply_foliage(canvas[:3], changed, self.crown_maps, backend), canvas[3:]])
+        covered = weather and self.closed_sky_gain is not None
+        if covered:
+            hidden = 1.0 - sunlight_share(environment.weather.to(self.like))
+            canvas = torch.cat([canvas[:3] * (1.0 + hidden * self.closed_sky_gain), canvas[3:]])
         if self.occluders is not None:
-            layers = self.occluders.append_to(layers, canvas[:3] - self.canvas[:3] if foliage else None)
+            changed = foliage or covered
+            layers = self.occluders.append_to(layers, canvas[:3] - self.canvas[:3] if changed else None)
         drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)
         behind = self.scene.environment
         shows: Tensor | None = None

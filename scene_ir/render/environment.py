@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import kornia
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
 from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab, smoothstep
-from scene_ir.types import DAYLIGHT_DIM, Environment, SceneIR
+from scene_ir.types import DAYLIGHT_DIM, Environment, SceneIR, Weather
 
 
 def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
@@ -40,6 +41,40 @@ def shadow_softening(weather: Tensor) -> Tensor:
 def low_sun_share(fog: Tensor, rain: Tensor, overcast: Tensor) -> Tensor:
     """Share () of a low sun's warm light that reaches the street: under clouds and in fog, dusk is grey to blue."""
     return (1.0 - fog) * (1.0 - rain) * (1.0 - overcast)
+
+
+def sunlight_share(weather: Tensor) -> Tensor:
+    """Share () of the photographed sunlight that is left under a weather code (5,); 1 at code 0. Twilight and night
+    have none, fog, rain and clouds cover it.
+    """
+    clear = low_sun_share(weather[Weather.FOG], weather[Weather.RAIN], weather[Weather.OVERCAST])
+    return clear * (1.0 - weather[Weather.TIME].square()) * (1.0 - weather[Weather.NIGHT])
+
+
+@torch.no_grad()
+def compute_closed_sky_gain(closed_sky: Tensor, background: Tensor, sky: Tensor, focal_px: float) -> Tensor:
+    """Relative change (3, H, W) of a background under a closed sky.
+
+    A guided filter (He et al., ECCV 2010) moves the steps of the codes to the background's edges, where cast shadows
+    end. The sky does not change: its colour is the weather's.
+
+    Args:
+        closed_sky: (3, h, w), see `Environment.closed_sky`.
+        background: (3, H, W) RGB in [0, 1].
+        sky: (H, W) in [0, 1].
+        focal_px: Focal length.
+    """
+    log_ratio, image = (
+        np.ascontiguousarray(t.permute(1, 2, 0).float().cpu().numpy()) for t in (closed_sky, background)
+    )
+    log_ratio = (2.0 * log_ratio - 1.0) * np.float32(model.CLOSED_SKY_LOG)
+    large = cv2.resize(log_ratio, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    guide = np.log(image + np.float32(model.CLOSED_SKY_OFFSET))
+    radius = max(2, round(model.CLOSED_SKY_RADIUS * focal_px))
+    sharp = cv2.ximgproc.guidedFilter(guide, large, radius, model.CLOSED_SKY_EDGE)
+    gain = np.expm1(sharp.clip(-model.CLOSED_SKY_LOG, model.CLOSED_SKY_LOG))
+    change = torch.from_numpy(np.ascontiguousarray(gain.transpose(2, 0, 1))).to(background)
+    return change * (1.0 - sky.to(change))
 
 
 def time_gain(time: Tensor, low_sun: Tensor) -> Tensor:
@@ -241,10 +276,11 @@ class PerturbedSun:
 
     @classmethod
     def from_environment(cls, environment: Environment, like: Tensor, sunlight: Tensor) -> PerturbedSun:
-        """The sun under `environment.light`; at code 0 exactly the photographed one, with both factors 1.
+        """The sun under `environment.light`, and as far as `environment.weather` leaves it; at code 0 exactly the
+        photographed one, with both factors 1.
 
         Args:
-            environment: Sun, ground and light code.
+            environment: Sun, ground, light and weather code; weather covers the sun where the closed sky is known.
             like: Tensor of the wanted dtype and device.
             sunlight: () Strength of the photographed sun, as in `Source.sunlight`.
         """
@@ -257,6 +293,8 @@ class PerturbedSun:
         shade = _shadow_strength(direction, up, sunlight * strength) / _shadow_strength(sun, up, sunlight).clamp(
             min=1e-6
         )
+        if environment.closed_sky is not None:
+            strength = strength * sunlight_share(environment.weather.to(like))
         return cls(direction, strength, torch.where(sunlight > 0, shade, torch.ones_like(shade)))
 
 

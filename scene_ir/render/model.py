@@ -171,6 +171,13 @@ SKY_RGB = (0.78, 0.82, 0.87)
 """Colour of the air where the photograph shows no sky."""
 SHADOW_SOFTENING = (0.5, 0.4, 0.5, 0.6, 2.0)
 """Rates at which fog, rain, time, overcast and night weaken cast shadows."""
+CLOSED_SKY_LOG = 1.5
+"""Bound of the logarithm of what a closed sky changes: no pixel becomes more than 4.5 times as bright, or as dark."""
+CLOSED_SKY_OFFSET = 0.02
+"""Added to display values before their logarithm is taken."""
+CLOSED_SKY_RADIUS, CLOSED_SKY_EDGE = 0.02, 2e-3
+"""Guided filter: radius as a share of the focal length, and the variance of the logarithm from which an edge is one.
+"""
 OVERCAST = 0.85
 """Weight of the picture under a closed cover at overcast 1."""
 OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.55, 0.88

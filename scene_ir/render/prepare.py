@@ -23,7 +23,12 @@ from torch import Tensor
 from scene_ir.meshes.lod import level_of_detail
 from scene_ir.raster import verbs
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
-from scene_ir.render.environment import PerturbedSun, compute_crown_maps, sky_colour
+from scene_ir.render.environment import (
+    PerturbedSun,
+    compute_closed_sky_gain,
+    compute_crown_maps,
+    sky_colour,
+)
 from scene_ir.render.lamps import VehicleLamps, find_lamps
 from scene_ir.render.night import NightMaps, compute_night_maps
 from scene_ir.render.surfaces import ObjectSurfaces, TemplateSurface, VertexPlacement
@@ -356,11 +361,23 @@ class PreparedScene:
 
     def perturbed_sun(self, environment: Environment) -> PerturbedSun | None:
         """The sun of a perturbed scene; None where it is the photographed one."""
-        if not len(self.sunlight) or not is_active(environment.light):
+        base = self.scene.environment
+        covered = base.closed_sky is not None and is_active(environment.weather)
+        if not len(self.sunlight) or not (covered or is_active(environment.light)):
             return None
-        return PerturbedSun.from_environment(
-            replace(self.scene.environment, light=environment.light), self.like, self.sunlight.mean()
+        changed = replace(base, light=environment.light, weather=environment.weather)
+        return PerturbedSun.from_environment(changed, self.like, self.sunlight.mean())
+
+    @cached_property
+    def closed_sky_gain(self) -> Tensor | None:
+        """See `environment.compute_closed_sky_gain`; None where the closed sky is not known."""
+        environment, camera = self.scene.environment, self.scene.camera
+        if environment.closed_sky is None:
+            return None
+        gain = compute_closed_sky_gain(
+            environment.closed_sky, self.scene.background, environment.sky, float(camera.intrinsics[0, 0])
         )
+        return gain.to(self.like)
 
     def local_vertices(self, objects: Objects) -> Tensor:
         """Vertices (V, 3) m in their objects' frames."""

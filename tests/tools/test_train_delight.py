@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from scene_ir.derender import delight
 from scene_ir.derender.delight import DelightNet
+from scene_ir.render.model import CLOSED_SKY_LOG
 from tests.tools.loading import tool
 
 training: Any = tool("train_delight")
@@ -61,7 +61,7 @@ def test_some_examples_are_under_clouds_already(store: Any) -> None:
 def test_the_truth_costs_least(store: Any) -> None:
     image, clouded, _, sky = training.build_batch(store, 0, SETTINGS)
     true = training.true_log_ratio(image, clouded)
-    assert float(true.abs().max()) <= delight.MAX_LOG_RATIO
+    assert float(true.abs().max()) <= CLOSED_SKY_LOG + 1e-6
     assert float(training.compute_loss(true, true, sky, 0.5)) == 0
     assert float(training.compute_loss(true + 0.1, true, sky, 0.5)) > 0
     # the sky does not count
@@ -75,6 +75,8 @@ def test_judged_against_the_street_under_clouds(pair: Any) -> None:
     metrics = training.judge(network, [pair])
     assert set(metrics) == {"sun", "clouds"}
     before, after = metrics["sun"]
-    assert before == pytest.approx(after, abs=1e-4)  # a network without an opinion changes no pixel
+    assert before == pytest.approx(
+        after, abs=0.1
+    )  # a network without an opinion changes no pixel by more than a code
     assert metrics["clouds"][0] == 80  # the picture itself
     assert training.format_table(metrics).count("\n") == 1 + len(metrics)

@@ -436,7 +436,9 @@ def _damp_adjoint_kernel(
     store3(grad_image, i, plane, g_colour)
     first_parts = load3(code_parts, i + plane, plane)
     last_part = load(code_parts, i + 4 * plane)
-    _store4(code_parts, i + plane, plane, wp.vec4f(first_parts[0], first_parts[1], first_parts[2], last_part) + parts)
+    _store4(
+        code_parts, i + plane, plane, wp.vec4f(first_parts[0], first_parts[1], first_parts[2], last_part) + parts
+    )
     store(grad_maps, i, g_sky)
 
 
