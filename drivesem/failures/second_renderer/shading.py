@@ -231,9 +231,7 @@ def apply_night(
     lamps = np.zeros_like(light)
     for i, pose in enumerate(poses):
         _draw_lamps(lamps, owner == i + 1, pose, camera, clear)
-    glare = cv2.GaussianBlur(lamps, (0, 0), 0.01 * camera.height) + cv2.GaussianBlur(
-        lamps, (0, 0), 0.04 * camera.height
-    )
+    glare = sum(cv2.GaussianBlur(lamps, (0, 0), width * camera.height) for width in (0.01, 0.04))
     return ((light + strength * (lamps + 0.3 * glare)) ** (1 / _GAMMA)).astype(np.float32)
 
 
