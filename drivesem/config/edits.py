@@ -43,7 +43,7 @@ WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "sunset": {"time": 0.5},
     "overcast": {"overcast": 1.0},
     "twilight": {"time": 1.0},
-    "night": {"night": 1.0, "overcast": 0.5},
+    "night": {"night": 1.0, "overcast": 0.3},
 }
 """Weather codes by name; all others are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "remove")

@@ -193,7 +193,8 @@ def draw_lamps(
     core = (radius.square() + model.LAMP_LEAST_PX**2).sqrt()
     area = radius.square()
     growth = 1.0 + model.GLARE_FOG * weather[Weather.FOG] + model.GLARE_RAIN * weather[Weather.RAIN]
-    spots = [(xy, area / core.square(), core, core)]
+    stretch_x, stretch_y = model.LAMP_STRETCH
+    spots = [(xy, area / core.square(), stretch_x * core, stretch_y * core)]
     for k, (sigma, share) in enumerate(model.GLARE):
         # Drops scatter wider than the lens.
         spread = (core.square() + (sigma * height) ** 2).sqrt()
@@ -201,7 +202,10 @@ def draw_lamps(
     across, along = model.STREAK
     streak = model.STREAK_SHARE * area / (across * along * height**2)
     spots.append((xy, streak, torch.full_like(core, across * height), torch.full_like(core, along * height)))
+    # The middle of a tail lamp overflows into white.
+    overflow = model.TAIL_CORE * colours[:, :1] * (~front)[:, None]
     light = _splat(spots, colours, height, width)
+    light = light + _splat(spots[:1], overflow.expand_as(colours), height, width)
     wet = model.DRY_MIRROR + (model.WET_MIRROR - model.DRY_MIRROR) * weather[Weather.RAIN]
     drop = (mirror_xy[:, 1] - xy[:, 1]).clamp(min=1.0)
     mirrored = [(mirror_xy, area / core.square(), 1.5 * core, model.MIRROR_LENGTH * drop + core)]

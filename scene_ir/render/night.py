@@ -35,6 +35,8 @@ class NightMaps:
     share of the pixel that shines; loss of light towards the corners; standard normal noise (3); glare (3), light."""
     camera_m: float
     """Height of the camera above the ground."""
+    by_day: float
+    """How far the photograph is taken by day, in [0, 1]; the code changes it so far."""
 
 
 @torch.no_grad()
@@ -59,8 +61,12 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     aim = model.HEAD_SIDE + (1 - model.HEAD_SIDE) * np.exp(-np.square(tangent / model.HEAD_AIM))
     aim = aim * (1 + model.RETRO * _signs(rgb, sky, leaves))
     above_m = height_above_ground(scene.depth, scene.environment.ground, scene.camera.matrix).cpu().numpy()
-    lit = _lit_share(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
     street = _street_light(tangent * np.where(np.isfinite(depth), depth, 0.0), depth, rgb, leaves)
+    road = scene.environment.road.double().cpu().numpy()[..., None]
+    level = float((road * np.square(rgb)).sum() / max(3 * float(road.sum()), 1.0)) or model.ROAD_LIGHT
+    exposure = float(np.clip(model.ROAD_LIGHT / level, *model.EXPOSURE))
+    aim = exposure * aim
+    lit = _lit_share(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
     horizon = float(matrix[1, 2] / height)
     glow = np.exp(-np.maximum(horizon - rows.numpy() / height, 0.0) / model.GLOW_HEIGHT)
     lamps = _street_lamps(scene, depth, camera_m)
@@ -70,7 +76,14 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     planes = [rise.numpy(), aim, np.where(sky > 0.5, glow, street), lit, 2 * model.CORNER * radius]
     fixed = torch.from_numpy(np.stack([*planes])).to(like)
     glare = torch.from_numpy(np.ascontiguousarray(np.moveaxis(glare + lamps, 2, 0))).to(like)
-    return NightMaps(torch.cat([fixed, _noise_field(height, width).to(like), glare]), camera_m)
+    return NightMaps(
+        torch.cat([fixed, _noise_field(height, width).to(like), glare]), camera_m, measure_daylight(scene)
+    )
+
+
+def measure_daylight(scene: SceneIR) -> float:
+    """How far a scene's photograph is taken by day, in [0, 1]."""
+    return float(_ramp(np.array(float(scene.photograph.square().mean())), *model.BY_DAY))
 
 
 def apply_night(
@@ -95,7 +108,7 @@ def apply_night(
         backend: Implementation.
     """
     code = environment.weather.to(image)
-    share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) / math.expm1(-model.NIGHTFALL)
+    share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) * (night.by_day / math.expm1(-model.NIGHTFALL))
     growth = 1.0 + model.GLARE_FOG * code[Weather.FOG] + model.GLARE_RAIN * code[Weather.RAIN]
     sky, maps = environment.sky.to(image), night.maps.to(image)
     if backend == "warp":
@@ -110,10 +123,15 @@ def apply_night(
     head = beam / (1.0 + (depth / model.HEAD_FAR_M).square())
     colours = image.new_tensor([model.STREET_RGB, model.HEAD_RGB, (model.LIT_GAIN,) * 3, model.GLOW_RGB])
     colours = colours[..., None, None]
-    shone = maps[STREET] * colours[0] + head * colours[1] + lit * colours[2]
+    shone = maps[STREET] * colours[0] + lit * colours[2]
     day = image.square()
     surface = day / (1.0 + model.SUN_SOFTENED * day)
-    light = surface * shone * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:NIGHT_MAPS]
+    headlit = head * colours[1] * (day + model.RETRO_WHITE * day.pow(3))
+    light = (
+        (surface * shone + headlit) * (1.0 - sky)
+        + sky * maps[STREET] * colours[3]
+        + growth * maps[GLARE:NIGHT_MAPS]
+    )
     bend = model.NIGHT_BEND**2
     dark = image + (torch.sqrt(day + share * (light - day) + lamps + bend) - torch.sqrt(day + bend))
     seen = dark * (1.0 - share * maps[CORNER])
