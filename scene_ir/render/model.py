@@ -227,7 +227,7 @@ ROAD_LIGHT, EXPOSURE = 0.13, (0.4, 1.2)
 """Light of a photographed road that the headlamps' light is for; it changes in inverse proportion to it, within bounds,
 as a camera's exposure by night does not depend on that by day.
 """
-BY_DAY = (0.03, 0.10)
+BY_DAY = (0.07, 0.12)
 """Mean light of a photograph that is taken by night, which the code hardly changes, and of one by day."""
 STREET_LAMP_M, STREET_ASIDE_M, STREET_EVERY_M, STREET_FAR_M = 8.0, 7.0, 32.0, 160.0
 """Height of street lamps; their distance from the camera's path, alternately left and right; and along it, up to

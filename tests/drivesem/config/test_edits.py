@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,14 @@ def test_the_sun_is_a_code_of_the_scene(street: Street) -> None:
         edit_of("sun.height=1")
     with pytest.raises(FormatError, match=r"sun.azimuth: expected a code in \[-1, 1\], found 2.0"):
         edit_of("sun.azimuth=2")
+
+
+def test_night_on_a_photograph_by_night_has_a_note(street: Street) -> None:
+    scene = street(positions_xz=())
+    edit = edit_of("weather=night")
+    note = "weather.night: the photograph is taken by night, so the code changes little"
+    assert note in apply_edit(replace(scene, photograph=torch.full_like(scene.photograph, 0.1)), edit).notes
+    assert note not in apply_edit(replace(scene, photograph=torch.full_like(scene.photograph, 0.5)), edit).notes
 
 
 def test_later_settings_of_the_same_parameter_win() -> None:
