@@ -96,11 +96,13 @@ def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) 
         bend = summed([[none, *(c.mesh or none for c in row)] for row in changes])
         grown = summed([[(1.0,), *((c.size,) for c in row)] for row in changes])
         paint = summed([[(0.0,) * objects.texture_code.shape[1], *(c.color for c in row)] for row in changes])
+        lamps = summed([[(0.0,), *((c.lamps,) for c in row)] for row in changes])[:, 0]
         changed_fields = {
             "translation": objects.translation + shift.sum(dim=1),
             "yaw": objects.yaw + turn,
             "ffd": objects.ffd + ffd.from_symmetric(bend) + _shape_shares(scene, changes, bent),
             "size_lhw": objects.size_lhw * grown,
+            "lamps": (objects.lamps + lamps).clamp(-1.0, 1.0),
             "texture_code": (objects.texture_code + paint).clamp(-limits.color, limits.color),
         }
     weather = environment.weather + environment.weather.new_tensor(edit.weather)

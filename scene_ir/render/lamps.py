@@ -156,7 +156,7 @@ def _project_lamps(
 def draw_lamps(
     lamps: VehicleLamps, scene: SceneIR, objects: Objects, number: Tensor, environment: Environment, centre: Tensor
 ) -> Tensor:
-    """Light (3, H, W) of the vehicles' lamps, as squares of display values; exactly 0 at weather 0.
+    """Light (3, H, W) of the vehicles' lamps, as squares of display values; exactly 0 at weather 0 and `lamps` 0.
 
     Args:
         lamps: Of `find_lamps`.
@@ -171,7 +171,9 @@ def draw_lamps(
     xy, depth, facing = _project_lamps(lamps, scene, objects, centre)
     mirror_xy, *_ = _project_lamps(lamps, scene, objects, centre, mirrored=True)
     seen = _visible_share(number, xy.detach(), depth.detach())
-    index = ((seen > 0) & (facing.detach() > 0) & (lamps.driven[:, None] > 0)).reshape(-1).nonzero()[:, 0]
+    coded = objects.lamps.requires_grad or bool((objects.lamps != 0).any())
+    may_shine = (lamps.driven > 0) | coded
+    index = ((seen > 0) & (facing.detach() > 0) & may_shine[:, None]).reshape(-1).nonzero()[:, 0]
     if not len(index):
         return centre.new_zeros(3, height, width)
     xy, mirror_xy = (places.reshape(-1, 2)[index] for places in (xy, mirror_xy))
@@ -183,9 +185,11 @@ def draw_lamps(
         model.FOG_EXTINCTION_PER_M * weather[Weather.FOG] + model.RAIN_EXTINCTION_PER_M * weather[Weather.RAIN]
     )
     beam = torch.where(front, model.HEADLAMP_WIDE + (1 - model.HEADLAMP_WIDE) * facing.clamp(min=0.0) ** 8, 1.0)
-    strength = (
-        exposure * lamps_on(weather) * seen * lamps.driven[index // 4] * smoothstep(facing, *model.LAMP_FACES)
-    )
+    code = objects.lamps.to(centre)[index // 4]
+    braking = code * torch.sigmoid(model.LAMP_BEND * code)
+    off = -code * torch.sigmoid(-model.LAMP_BEND * code)
+    level = lamps_on(weather) * lamps.driven[index // 4] * (1.0 - off) + model.BRAKE_LAMP * braking * ~front
+    strength = exposure * level.clamp(min=0.0) * seen * smoothstep(facing, *model.LAMP_FACES)
     strength = strength * beam * torch.exp(-extinction * depth)
     colours = centre.new_tensor([model.TAIL_LAMP_RGB, model.HEADLAMP_RGB])[front.long()] * strength[:, None]
     radius = model.LAMP_RADIUS_M * scene.camera.matrix[0, 0].to(depth) / depth

@@ -278,6 +278,8 @@ TAIL_CORE = 0.12
 """Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
 LAMP_STRETCH = (1.5, 0.7)
 """Width and height of a lamp, relative to its radius."""
+BRAKE_LAMP, LAMP_BEND = 2.5, 6.0
+"""Light of a brake lamp, relative to a tail lamp's; how sharply lamps code 0 separates off from braking."""
 LAMP_BY_DAY = 0.12
 """The same by daylight, where the exposure is shorter."""
 LAMP_RADIUS_M, LAMP_LEAST_PX = 0.065, 0.6

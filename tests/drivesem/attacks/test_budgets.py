@@ -156,7 +156,7 @@ def test_a_street_is_longer_along_than_across(street):
     papers = ParameterSpace(scene, PAPER_PARAMETERS, Budget(night=1.0))
     size = space.blocks.get(Parameter.SIZE)
     assert space.upper[size].tolist() == pytest.approx([0.1] * 4)
-    assert space.upper[size.stop :].tolist() == [1.0] * 3  # the sun's
+    assert space.upper[size.stop :].tolist() == [1.0] * 7  # the sun's and the lamps'
     wider = papers.upper != space.upper[: size.start]
     assert not bool(wider[: where.start].any() or wider[where.stop :].any())
 

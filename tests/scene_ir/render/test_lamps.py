@@ -126,6 +126,35 @@ def test_on_the_photographs_own_lamp(photographed: SceneIR, compositor: Composit
     assert not unmoved.any()  # its headlamps are not in the photograph
 
 
+def test_a_code_switches_them_off_and_brakes(compositor: Compositor) -> None:
+    scene = compositor.scene
+
+    def red_light(code: float, night: float) -> float:
+        lamps_code = torch.zeros(3, dtype=torch.float64)
+        lamps_code[AHEAD] = code
+        perturbed = scene.with_objects(lamps=lamps_code)
+        return float(_light(compositor, _code(night=night), perturbed)[0].sum())
+
+    assert red_light(0.0, 0.0) == 0.0
+    assert red_light(1.0, 0.0) > red_light(0.5, 0.0) > 0.05
+    assert red_light(-1.0, 1.0) < red_light(0.0, 1.0) < red_light(1.0, 1.0)
+    without = lamps.draw_lamps(
+        _without(compositor, AHEAD), scene, scene.objects, compositor.render(scene).object_id,
+        replace(scene.environment, weather=_code(night=1.0)), compositor.centre,
+    )  # fmt: skip
+    assert red_light(-1.0, 1.0) == pytest.approx(float(without[0].sum()), rel=0.01)
+
+
+def test_brake_lamps_by_day_change_their_surroundings_only(photographed: SceneIR) -> None:
+    compositor = Compositor(photographed, RenderSettings(backend="reference"))
+    code = torch.zeros(3, dtype=torch.float64)
+    code[AHEAD] = 1.0
+    change = compositor.render(photographed.with_objects(lamps=code)).image - compositor.render(photographed).image
+    assert float(change.amin()) > -1e-9
+    assert float(change[0].amax()) > 0.1
+    assert float(change[:, :10].abs().amax()) < 0.01
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_templates_know_their_lamps(kind: str) -> None:
     places = lamps._lamp_places(template(kind))
@@ -140,13 +169,14 @@ def test_gradients_to_poses_and_weather_are_those_of_differences(compositor: Com
     number = compositor.render(scene).object_id
     weights = torch.randn(3, *number.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
-    def total(move: Tensor, turn: Tensor, bend: Tensor, code: Tensor) -> Tensor:
+    def total(move: Tensor, turn: Tensor, bend: Tensor, code: Tensor, on: Tensor) -> Tensor:
         objects = scene.objects
         moved = replace(
             objects,
             translation=objects.translation + move,
             yaw=objects.yaw + turn,
             ffd=objects.ffd + bend[:, None, None],
+            lamps=on,
         )
         environment = replace(scene.environment, weather=code)
         found = lamps.draw_lamps(compositor.lamps, scene, moved, number, environment, compositor.centre)
@@ -154,7 +184,8 @@ def test_gradients_to_poses_and_weather_are_those_of_differences(compositor: Com
 
     count = len(scene.objects)
     start = [torch.zeros(count, n, dtype=torch.float64).squeeze(1) for n in (3, 1, 1)]
-    start.append(_code(fog=0.3, rain=0.4, time=0.1, overcast=0.2, night=0.6))
+    start.append(torch.tensor([0.3, -0.4, 0.1], dtype=torch.float64))
+    start.insert(3, _code(fog=0.3, rain=0.4, time=0.1, overcast=0.2, night=0.6))
     assert torch.autograd.gradcheck(total, [t.requires_grad_() for t in start])
 
 
