@@ -149,7 +149,9 @@ def _lit_share(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
     windows are; not next to the sky, as its light comes through leaves and wires.
     """
     size = max(3, rgb.shape[0] // 24) | 1
-    value = rgb.max(axis=2)
+    # Thin bright lines are frames and wires.
+    solid = max(3, rgb.shape[0] // 150)
+    value = cv2.morphologyEx(rgb.max(axis=2), cv2.MORPH_OPEN, np.ones((solid, solid)))
     around = cv2.morphologyEx(value, cv2.MORPH_OPEN, np.ones((size, size)))
     near_sky = cv2.dilate((open_to > 0.2).astype(np.float64), np.ones((2 * size + 1,) * 2))
     small = _ramp(value - around, *model.LIT_CONTRAST)
