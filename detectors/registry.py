@@ -44,11 +44,15 @@ ONNX_RUNTIME = "onnx-runtime"
 """Kind of an ONNX graph without a gradient."""
 HUGGING_FACE = "hf"
 """Kind of a model of transformers: hf:FOLDER or hf:NAME."""
+MODULE = "module"
+"""Kind of a class of the user: module:FILE.py:CLASS."""
+MAITE = "maite"
+"""Kind of a model by MAITE's protocol: maite:FILE.py:NAME."""
 DARKNET = "darknet:"
 """Prefix of Darknet files: darknet:FILE.cfg,FILE.weights; the second may be omitted if it has the same name."""
-KINDS = (ONNX, ONNX_RUNTIME, HUGGING_FACE, "torchvision", "ultralytics", "torchscript", "export", "module")
+KINDS = (ONNX, ONNX_RUNTIME, HUGGING_FACE, "torchvision", "ultralytics", "torchscript", "export", MODULE, MAITE)
 """Prefixes of detectors from elsewhere: KIND:WHAT[,MORE][,SPEC.yaml]."""
-RUNS_CODE = ("ultralytics", "torchscript", "export", "module")
+RUNS_CODE = ("ultralytics", "torchscript", "export", MODULE, MAITE)
 """Kinds that run code from their files when loaded."""
 _SPEC_SUFFIXES = (".yaml", ".yml")
 _MAX_CLASSES = 10_000
@@ -57,7 +61,7 @@ _MAX_ANCHORS = 1000
 
 
 AnyDetector: TypeAlias = "str | Path | Predictor | nn.Module | Callable[[Tensor], Any]"
-"""A name or file, a detector, a torch module with known outputs, or a function of images."""
+"""A name or file, a detector, a torch module with known outputs, a MAITE model, or a function of images."""
 
 
 def find_code_to_run(name_or_path: str | Path) -> str | None:
@@ -81,9 +85,10 @@ def load_predictor(
 
     Args:
         detector: `onnx-runtime:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts; or an object: a detector,
-            which is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); or a
-            function from images (1, 3, H, W), RGB in [0, 1], to `boxes` (M, 4) px, `scores` (M,) and `labels` (M,)
-            in a dict, as torchvision's detectors return them.
+            which is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); a
+            MAITE model (`detectors.adapters.maite`); or a function from images (1, 3, H, W), RGB in [0, 1], to
+            `boxes` (M, 4) px, `scores` (M,) and `labels` (M,) in a dict, as torchvision's detectors return them, or
+            to `supervision.Detections`.
         device: Device of the weights; ONNX Runtime runs on the CPU. An object stays where it is.
         tiling: Of an ONNX graph, "auto" or "off" (see `detectors.adapters.onnx`).
         classes: Class names that the labels of a function index, or of a torch module without a `spec`.
@@ -176,8 +181,10 @@ def _load_adapted(kind: str, rest: str, device: str | torch.device, tiling: str 
         from detectors.adapters.onnx import OnnxPredictor
 
         return OnnxPredictor(Path(arguments[0]), tiling, spec)
-    from detectors.adapters.network import require_gradient
+    from detectors.adapters.network import load_maite_model, require_gradient
 
+    if kind == MAITE:
+        return load_maite_model(arguments[0], spec)
     return require_gradient(_load_network(kind, arguments, spec).requires_grad_(False).to(device))
 
 
@@ -191,7 +198,7 @@ def _load_network(kind: str, arguments: list[str], spec: Path | None) -> Detecto
         from detectors.adapters.torchvision_models import load_torchvision
 
         return load_torchvision(*arguments, spec=spec)
-    if kind == "module":
+    if kind == MODULE:
         from detectors.adapters.network import load_user_detector
 
         return load_user_detector(arguments[0], spec)
@@ -209,7 +216,7 @@ def _split_arguments(kind: str, rest: str) -> tuple[list[str], Path | None]:
     """The comma-separated arguments after a prefix, and the YAML file if the last one is one."""
     commas = [i for i, letter in enumerate(rest) if letter == "," and rest.endswith(_SPEC_SUFFIXES)]
     for end in (len(rest), *commas):  # a file's name may contain commas
-        file, colon, name = rest[:end].rpartition(":") if kind == "module" else (rest[:end], ":", "file")
+        file, colon, name = rest[:end].rpartition(":") if kind in (MODULE, MAITE) else (rest[:end], ":", "file")
         if kind != "torchvision" and colon and name.isidentifier() and Path(file).is_file():
             return [rest[:end]], Path(rest[end + 1 :]) if end < len(rest) else None
     words = [word.strip() for word in rest.split(",")]
