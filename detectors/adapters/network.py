@@ -327,7 +327,7 @@ def load_user_detector(spec_name: str, spec: Path | None = None) -> Detector:
     Raises:
         DetectorError: There is no such class, or it is something else.
     """
-    found = _find_object("module", spec_name)
+    found = _find_object("module", spec_name, "CLASS")
     where, _, name = spec_name.rpartition(":")
     if not isinstance(found, type):
         raise DetectorError(f"{where}: expected a class {name}, found {type(found).__name__}")
@@ -347,7 +347,9 @@ def load_maite_model(spec_name: str, spec: Path | None = None) -> Predictor:
     Raises:
         DetectorError: There is no such name, or it is something else.
     """
-    found = _find_object("maite", spec_name)
+    found = _find_object("maite", spec_name, "NAME")
+    if found is None:
+        raise DetectorError(f"maite: expected a model, class or function {spec_name}, found no such name")
     with _named_user_errors(spec_name):
         model = found() if isinstance(found, type) or inspect.isroutine(found) else found
         return adapt_maite_model(model, {} if spec is None else load_spec(spec), spec_name)
@@ -410,20 +412,20 @@ def adapt_object(instance: Any, classes: Sequence[str] | str | None = None) -> P
     return FunctionPredictor(getattr(instance, "__name__", "function"), instance, settings["classes"])
 
 
-def _find_object(kind: str, spec_name: str) -> Any:
-    """The object FILE.py:NAME or PACKAGE.MODULE:NAME."""
+def _find_object(kind: str, spec_name: str, what: str) -> Any:
+    """The object FILE.py:NAME or PACKAGE.MODULE:NAME; None if the file has no such name."""
     where, colon, name = spec_name.rpartition(":")
     if not (colon and where and name.isidentifier()):
-        raise DetectorError(f"{kind}: expected FILE.py:NAME or PACKAGE.MODULE:NAME, found {spec_name!r}")
+        raise DetectorError(f"{kind}: expected FILE.py:{what} or PACKAGE.MODULE:{what}, found {spec_name!r}")
     try:
         if where.endswith(".py"):
-            found = getattr(_import_file(Path(where)), name)
+            found = getattr(_import_file(Path(where)), name, None)
         else:
             found = pkgutil.resolve_name(f"{where}:{name}")
     except ImportError as error:
         raise DetectorError(f"{kind}: expected a module {where}, found {error}") from None
     except AttributeError:
-        raise DetectorError(f"{where}: expected {name}, found no such name") from None
+        found = None
     home = found if isinstance(found, type) or inspect.isroutine(found) else type(found)
     _LOADED.add(str(getattr(sys.modules.get(home.__module__), "__file__", None)))
     return found
