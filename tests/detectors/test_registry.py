@@ -63,7 +63,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
         DetectorError,
         match=r"detector: expected squeezedet, yolov3-slim, a path\.safetensors, or a name with prefix darknet:, "
-        r".*, module:, ensemble: or planted:, found 'yolo9'$",
+        r".*, module:, maite:, ensemble: or planted:, found 'yolo9'$",
     ):
         load_detector("yolo9")
 
