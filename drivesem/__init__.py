@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from detectors.adapters.maite import MaiteModel
     from detectors.adapters.supervision import from_supervision, to_supervision
+    from detectors.adapters.torchvision_interface import TorchvisionModule
     from detectors.registry import load_predictor as load_detector
     from drivesem.analyses import confirm, explain, gate, holes, report, transfer, verify
     from drivesem.protocols.attack import MaiteAttack
@@ -39,6 +40,7 @@ __all__ = [
     "MaiteMetric",
     "MaiteModel",
     "Scene",
+    "TorchvisionModule",
     "attack",
     "confirm",
     "demo_scene",
@@ -64,6 +66,7 @@ __version__ = "0.1.0"
 _NAMES_BY_MODULE = {
     "detectors.adapters.maite": ("MaiteModel",),
     "detectors.adapters.supervision": ("from_supervision", "to_supervision"),
+    "detectors.adapters.torchvision_interface": ("TorchvisionModule",),
     "detectors.registry": ("load_detector",),
     "drivesem.analyses": ("confirm", "explain", "gate", "holes", "report", "transfer", "verify"),
     "drivesem.protocols.attack": ("MaiteAttack",),

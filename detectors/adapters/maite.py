@@ -108,7 +108,7 @@ def image_from_array(image: Any) -> Tensor:
 
 
 def is_maite_model(instance: Any) -> bool:
-    """Whether an object has what MAITE's protocol `Model` asks for."""
+    """Whether an object has what MAITE's protocol `Model` requires."""
     metadata = getattr(instance, "metadata", None)
     return (
         callable(instance)
@@ -125,12 +125,12 @@ def adapt_maite_model(model: Any, settings: Mapping[str, Any], where: str) -> Pr
     `scale: 255` for uint8, `channels: bgr`, `mean`, `std`; and give `classes` and `t_star`.
 
     Args:
-        model: The model, or a `MaiteModel`, whose detector is returned.
+        model: The model; of a `MaiteModel`, its detector is returned.
         settings: Settings of a `NetworkSpec` that override the attribute's.
         where: Beginning of error messages.
 
     Raises:
-        DetectorError: It lacks what the protocol asks for.
+        DetectorError: It lacks what the protocol requires.
     """
     if isinstance(model, MaiteModel):
         return model.detector

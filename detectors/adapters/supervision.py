@@ -26,11 +26,11 @@ def to_supervision(detections: Detections, classes: Sequence[str]) -> supervisio
         DetectorError: supervision is missing.
     """
     try:
-        from supervision import Detections as SupervisionDetections  # pyright: ignore[reportMissingImports]
+        import supervision  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise DetectorError("to_supervision: needs supervision: pip install 'drivesem[supervision]'") from None
     labels = detections.labels.cpu().numpy()
-    return SupervisionDetections(
+    return supervision.Detections(
         xyxy=detections.boxes_xyxy.cpu().numpy().astype(np.float32).reshape(-1, 4),
         confidence=detections.scores.cpu().numpy().astype(np.float32),
         class_id=labels.astype(int),

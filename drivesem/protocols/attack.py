@@ -125,7 +125,8 @@ class MaiteAttack:
             size_lhw=unknown,
             ignore_xyxy=torch.zeros(0, 4),
         )
-        return Frame(name, image, default_camera(*image.shape[1:], self._focal), labels)
+        height, width = image.shape[1:]
+        return Frame(name, image, default_camera(height, width, self._focal), labels)
 
     def _move_boxes(self, target: MaiteTarget, found: Counterexample) -> tuple[MaiteTarget, list[list[float]]]:
         """The target after an attack, and the boxes of vehicles that came to be hidden or too small."""

@@ -159,7 +159,7 @@ def test_a_maite_model_is_a_detector(name: str, file: Path, detector: Detector, 
     assert set(found.labels.tolist()) == {1}
 
 
-def test_settings_say_what_a_maite_model_gets(tmp_path: Path, picture: torch.Tensor) -> None:
+def test_settings_of_what_a_maite_model_gets(tmp_path: Path, picture: torch.Tensor) -> None:
     model = Recorder()
     detect(load_predictor(model), picture)
     assert model.batch[0].dtype == np.float32
@@ -201,7 +201,7 @@ def test_class_names_may_come_with_the_call() -> None:
         (Recorder({"scale": -1}), "detector recorder: spec: scale: expected a positive number, found -1"),
     ],
 )
-def test_objects_without_what_the_protocol_asks_for(model: Any, message: str) -> None:
+def test_objects_without_what_the_protocol_requires(model: Any, message: str) -> None:
     with pytest.raises(DetectorError, match=message) as caught:
         load_predictor(model)
     assert "\n" not in str(caught.value)
@@ -221,7 +221,7 @@ def test_objects_without_what_the_protocol_asks_for(model: Any, message: str) ->
         (SimpleNamespace(boxes=np.zeros((1, 4)), scores=np.zeros((1, 0)), labels=np.zeros(1)), r"\(1, 0\)"),
     ],
 )
-def test_targets_without_what_the_protocol_asks_for(found: Any, message: str, picture: torch.Tensor) -> None:
+def test_targets_without_what_the_protocol_requires(found: Any, message: str, picture: torch.Tensor) -> None:
     class Model(Recorder):
         def __call__(self, batch: Sequence[np.ndarray]) -> list[Any]:
             return [found]
@@ -271,11 +271,11 @@ def test_loading_runs_code_and_gives_no_gradient(file: Path, tmp_path: Path) -> 
     assert getattr(load_predictor(f"{name},{spec}"), "t_star", None) == 0.4
 
 
-def test_check_finds_cars_and_says_what_a_blind_model_gets(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_finds_cars_and_names_what_a_blind_model_gets(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "--detector", f"maite:{file}:Foreign"]) == 0
     file.write_text(FILE.replace("self.model(batch)", "self.model([image * 0 for image in batch])"))
     capsys.readouterr()
     assert main(["check", "--detector", f"maite:{file}:Foreign"]) == 1
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "RGB in [0, 1]" in shown
-    assert "gives uint8" in shown
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "RGB in [0, 1]" in printed
+    assert "gives uint8" in printed

@@ -63,7 +63,7 @@ def batch_of(data: Any, *rows: int) -> tuple[list[Any], list[Any], list[Any]]:
     return list(images), list(targets), list(metadata)
 
 
-def test_they_have_what_the_protocols_ask_for(data: ds.MaiteDataset, model: ds.MaiteModel) -> None:
+def test_they_have_what_the_protocols_require(data: ds.MaiteDataset, model: ds.MaiteModel) -> None:
     protocols = pytest.importorskip("maite.protocols.object_detection")
     assert isinstance(data, protocols.FieldwiseDataset)
     assert isinstance(model, protocols.Model)
@@ -154,7 +154,7 @@ def test_ignored_boxes_and_other_numbers() -> None:
         (SimpleNamespace(boxes=[[0, 0, 1, 1]], labels=[7], scores=[1]), r"labels among 0, 1, 2, 3 .*, found 7"),
     ],
 )
-def test_targets_without_what_the_protocol_asks_for(target: Any, message: str, data: ds.MaiteDataset) -> None:
+def test_targets_without_what_the_protocol_requires(target: Any, message: str, data: ds.MaiteDataset) -> None:
     with pytest.raises(ValueError, match=message):
         ds.MaiteMetric().update([target], [target], [{}])
     if "among" not in message:
@@ -199,7 +199,7 @@ def test_an_attack_without_frames_takes_boxes_and_types(data: ds.MaiteDataset, m
     """Images of floats, the names and numbers of another data set, and no camera."""
     (image,), (target,), _ = batch_of(data, 0)
     foreign = MaiteTarget(target.boxes, target.labels + 10, target.scores)
-    names = {10: "car", 11: "lorry", 12: "person", 13: "rider"}
+    names: dict[int, str] = {10: "car", 11: "lorry", 12: "person", 13: "rider"}
     floats = (image / 255).astype(np.float64)
     augmentation = ds.MaiteAttack(model, index2label=names, fit=False, **OPTIONS)
     (changed,), (after,), (metadata,) = augmentation(([floats], [foreign], [{"id": 3, "place": "here"}]))
@@ -324,7 +324,7 @@ def heart(monkeypatch: pytest.MonkeyPatch, quiet: None) -> Callable[..., Any]:
         import torchvision as _  # noqa: F401
     except (ImportError, RuntimeError):
         stand_in = types.ModuleType("torchvision")
-        stand_in.__version__ = "0.28.0"
+        stand_in.__dict__["__version__"] = "0.28.0"
         stand_in.__spec__ = ModuleSpec("torchvision", None)
         monkeypatch.setitem(sys.modules, "torchvision", stand_in)
     return estimators.JaticPyTorchObjectDetector
