@@ -150,7 +150,7 @@ def adapt_maite_model(model: Any, settings: Mapping[str, Any], where: str) -> Pr
         return model([array.round().astype(np.uint8) if as_bytes else array])
 
     pixels = "uint8" if as_bytes else f"{spec.channels.upper()} in [0, {spec.scale:g}]"
-    reading = f"the model gets {pixels}; `scale: 255` in its YAML file or attribute `spec` gives uint8"
+    reading = f"the model gets {pixels} (a YAML file or its attribute `spec` sets `scale`; 255 gives uint8)"
     return FunctionPredictor(str(model.metadata["id"]), detect, classes, spec.t_star, reading)
 
 

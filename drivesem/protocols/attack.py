@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from detectors.adapters.maite import MaiteTarget, image_from_array
 from detectors.registry import AnyDetector, load_predictor
 from detectors.types import CLASSES
+from drivesem.config.errors import UsageError
 from drivesem.data.label_table import UNKNOWN_OCCLUSION
 from drivesem.data.photographs import default_camera
 from drivesem.protocols.dataset import IGNORED_BOXES, Metadata
@@ -77,7 +78,7 @@ class MaiteAttack:
             The same for the changed images, of the same type.
 
         Raises:
-            UsageError: A wrong option of `ds.attack`, or a target without boxes, labels or scores.
+            UsageError: A wrong option of `ds.attack`, a target without boxes, labels or scores, or metadata without id.
             DetectorError: An image has another shape or range.
         """
         changed = [self._attack_image(*datum) for datum in zip(*batch, strict=True)]
@@ -86,6 +87,8 @@ class MaiteAttack:
     def _attack_image(
         self, image: Any, target: Any, metadata: Mapping[str, Any]
     ) -> tuple[NDArray[Any], MaiteTarget, Metadata]:
+        if not isinstance(metadata, Mapping) or "id" not in metadata:
+            raise UsageError("metadata", "a mapping with an id", repr(metadata)[:80])
         boxes, labels, scores = read_target(target)
         before = MaiteTarget(boxes.numpy(), labels.numpy(), scores.numpy())
         frame = self._frame(str(metadata["id"]), image_from_array(image), before)

@@ -271,7 +271,9 @@ def test_loading_runs_code_and_gives_no_gradient(file: Path, tmp_path: Path) -> 
     assert getattr(load_predictor(f"{name},{spec}"), "t_star", None) == 0.4
 
 
-def test_check_finds_cars_and_names_what_a_blind_model_gets(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_finds_cars_and_names_what_a_blind_model_gets(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["check", "--detector", f"maite:{file}:Foreign"]) == 0
     file.write_text(FILE.replace("self.model(batch)", "self.model([image * 0 for image in batch])"))
     capsys.readouterr()

@@ -167,6 +167,8 @@ def test_wrong_settings(data: ds.MaiteDataset) -> None:
         ds.MaiteMetric({0: "bus"})
     with pytest.raises(ValueError, match="steps: expected at least 1, found 0"):
         ds.MaiteAttack("squeezedet", fit=False, **(OPTIONS | {"steps": 0}))(batch_of(data, 0))
+    with pytest.raises(UsageError, match="metadata: expected a mapping with an id, found {}"):
+        ds.MaiteAttack("squeezedet")(([data[0][0]], [data[0][1]], [{}]))
     with pytest.raises(DetectorError, match="MAITE image: expected an image"):
         ds.MaiteAttack("squeezedet")(([np.zeros((8, 8, 3), np.uint8)], [data[0][1]], [{"id": "a"}]))
 
