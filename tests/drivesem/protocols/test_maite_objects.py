@@ -167,12 +167,13 @@ def test_wrong_settings(data: ds.MaiteDataset) -> None:
         ds.MaiteMetric({0: "bus"})
     with pytest.raises(ValueError, match="steps: expected at least 1, found 0"):
         ds.MaiteAttack("squeezedet", fit=False, **(OPTIONS | {"steps": 0}))(batch_of(data, 0))
-    with pytest.raises(UsageError, match="metadata: expected a mapping with an id, found {}"):
+    with pytest.raises(UsageError, match=r"metadata: expected a mapping with an id, found \{\}"):
         ds.MaiteAttack("squeezedet")(([data[0][0]], [data[0][1]], [{}]))
     with pytest.raises(DetectorError, match="MAITE image: expected an image"):
         ds.MaiteAttack("squeezedet")(([np.zeros((8, 8, 3), np.uint8)], [data[0][1]], [{"id": "a"}]))
 
 
+@pytest.mark.slow
 def test_an_attack_moves_the_labels(data: ds.MaiteDataset, detector: Detector) -> None:
     """It is `ds.attack` on the frame, and the boxes are those of the changed scene."""
     augmentation = ds.MaiteAttack(detector, frames=data.frames, fit=False, **OPTIONS)
@@ -425,6 +426,7 @@ class Wrapped:
 """
 
 
+@pytest.mark.slow
 def test_a_maite_model_is_attacked_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "wrapped.py").write_text(MODEL_FILE)
     name, out = f"maite:{tmp_path}/wrapped.py:Wrapped", tmp_path / "run"
