@@ -230,7 +230,7 @@ def test_gradient_through_batch_normalisation_equals_differences(kind: str, tmp_
         network.spec = yaml.safe_load(settings)
         detector = load_predictor(network)
     else:
-        path = tmp_path / "net.pt"
+        path = tmp_path / ("net.pt2" if kind == "export" else "net.pt")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if kind == "export":
