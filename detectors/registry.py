@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -152,7 +152,9 @@ def load_detector(
     if name.startswith(DARKNET):
         from detectors.yolov3 import darknet
 
-        network = darknet.load(*(Path(part) for part in rest.split(",", 1)))
+        pairs = (pair for pair in _split_at_commas(rest) if Path(pair[0]).is_file())
+        files = next(pairs, rest.partition(",")[::2])
+        network = darknet.load(*(Path(file) for file in files if file))
     elif name in SHIPPED:
         _check_card(SHIPPED[name])
         network = _load_weights_file(SHIPPED[name])
@@ -214,17 +216,25 @@ def _load_network(kind: str, arguments: list[str], spec: Path | None) -> Detecto
 
 def _split_arguments(kind: str, rest: str) -> tuple[list[str], Path | None]:
     """The comma-separated arguments after a prefix, and the YAML file if the last one is one."""
-    commas = [i for i, letter in enumerate(rest) if letter == "," and rest.endswith(_SPEC_SUFFIXES)]
-    for end in (len(rest), *commas):  # a file's name may contain commas
-        file, colon, name = rest[:end].rpartition(":") if kind in (MODULE, MAITE) else (rest[:end], ":", "file")
-        if kind != "torchvision" and colon and name.isidentifier() and Path(file).is_file():
-            return [rest[:end]], Path(rest[end + 1 :]) if end < len(rest) else None
+    name, comma, weights = rest.partition(",") if kind == "torchvision" else ("", "", rest)
+    for path, more in _split_at_commas(weights):
+        file, _, class_name = path.rpartition(":") if kind in (MODULE, MAITE) else (path, ":", "any")
+        found = class_name.isidentifier() and file and Path(file).exists() and not file.endswith(_SPEC_SUFFIXES)
+        if found and (not more or more.endswith(_SPEC_SUFFIXES)):
+            return [name, path] if comma else [path], Path(more) if more else None
     words = [word.strip() for word in rest.split(",")]
     spec = Path(words.pop()) if len(words) > 1 and words[-1].endswith(_SPEC_SUFFIXES) else None
-    most, more = (2, "[,WEIGHTS]") if kind == "torchvision" else (1, "")
+    most, expected = (2, "[,WEIGHTS]") if kind == "torchvision" else (1, "")
     if not 1 <= len(words) <= most or not all(words):
-        raise DetectorError(f"detector: expected {kind}:WHAT{more}[,SPEC.yaml], found {f'{kind}:{rest}'!r}")
+        raise DetectorError(f"detector: expected {kind}:WHAT{expected}[,SPEC.yaml], found {f'{kind}:{rest}'!r}")
     return words, spec
+
+
+def _split_at_commas(text: str) -> Iterator[tuple[str, str]]:
+    """The text whole, then divided at each comma, the last one first: a file's name may contain commas."""
+    yield text, ""
+    for place in reversed([i for i, letter in enumerate(text) if letter == ","]):
+        yield text[:place], text[place + 1 :]
 
 
 def _load_weights_file(path: Path) -> SqueezeDet | YoloV3:

@@ -23,7 +23,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detectors.adapters.dense import LEAST_SCORE, NMS_IOU, T_STAR, DenseDetector, DensePredictions
+from detectors.adapters.dense import (
+    LEAST_SCORE,
+    NMS_IOU,
+    T_STAR,
+    BatchNormGradientFix,
+    DenseDetector,
+    DensePredictions,
+)
 from detectors.adapters.formats import OutputDecoder, flatten_outputs, make_decoder
 from detectors.adapters.function import FunctionPredictor
 from detectors.adapters.maite import adapt_maite_model, is_maite_model
@@ -112,7 +119,8 @@ class NetworkDetector(DenseDetector):
         given: Any = normalise_images(network_input, spec)
         if spec.input != "batch":
             given = given[0] if spec.input == "image" else [given[0]]
-        return flatten_outputs(self._call[0](given))
+        with BatchNormGradientFix():
+            return flatten_outputs(self._call[0](given))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or convert the hidden exported module too."""
@@ -156,6 +164,7 @@ def load_torchscript(path: Path, spec: Path | None = None) -> NetworkDetector:
             for kind in (DeprecationWarning, FutureWarning):
                 warnings.simplefilter("ignore", kind)
             network = torch.jit.load(str(path), map_location="cpu", _extra_files=facts).eval()
+            network.to(memory_format=torch.channels_last)  # BatchNormGradientFix cannot reach into it
     except (RuntimeError, ValueError) as error:
         raise DetectorError(f"{path}: expected a TorchScript file, found {_last_line(error)}") from None
     names, size = _parse_ultralytics_facts(facts[_ULTRALYTICS_FACTS])
@@ -216,6 +225,8 @@ def _last_line(error: Exception) -> str:
 
 _ULTRALYTICS_STRIDE = 32
 """Ultralytics models get images padded to a multiple of this, px, without resizing."""
+_RTDETR_SIDE = 640
+"""Input of RT-DETR by default, px: images are stretched to a square."""
 
 
 class _FirstOutput(nn.Module):
@@ -230,9 +241,21 @@ class _FirstOutput(nn.Module):
         return given if isinstance(given, Tensor) else given[0]
 
 
+class _Queries(nn.Module):
+    """RT-DETR reduced to the boxes and logits of all its queries: its first output holds the best scores alone."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        _, (boxes, logits, *_) = self.model(images)
+        return boxes[-1], logits[-1]
+
+
 def load_ultralytics(path: Path, spec: Path | None = None) -> NetworkDetector:
-    """A model file of Ultralytics (YOLOv8, YOLO11, ...; AGPL-3.0) as a detector. The file is a pickle of a whole
-    module, so loading runs the code in it; torch's `weights_only` is not possible.
+    """A model file of Ultralytics (YOLOv8, YOLO11, RT-DETR, ...; AGPL-3.0) as a detector. The file is a pickle of a
+    whole module, so loading runs the code in it; torch's `weights_only` is not possible.
 
     Raises:
         DetectorError: The file is not one, or Ultralytics is missing.
@@ -246,17 +269,24 @@ def load_ultralytics(path: Path, spec: Path | None = None) -> NetworkDetector:
     if path.suffix != ".pt" or not path.is_file():
         raise DetectorError(f"{path}: expected a .pt file of Ultralytics, found none")
     try:
-        model: Any = YOLO(str(path)).model
+        loaded: Any = YOLO(str(path))
+        model = loaded.model
         head = model.model[-1]
         names = with_project_names(str(model.names[i]) for i in range(len(model.names)))
     except Exception as error:  # the reader and the pickle may raise anything
         raise DetectorError(f"{path}: expected a .pt file of Ultralytics, found {error}") from None
-    if not type(head).__name__.endswith("Detect"):
-        raise DetectorError(f"{path}: expected a detector, found one that ends in {type(head).__name__}")
+    own, kind = load_settings(path, spec), type(head).__name__
+    if kind == "RTDETRDecoder":
+        side = int(loaded.overrides.get("imgsz", _RTDETR_SIDE))
+        settings = {"format": "rtdetr", "boxes": "cxcywh", "normalised": True, "activation": "sigmoid"}
+        network = _Queries(model.float().eval())
+        return NetworkDetector(path.stem, network, settings | {"size": (side, side)} | own, names, where=str(path))
+    if not kind.endswith("Detect"):
+        raise DetectorError(f"{path}: expected a detector, found one that ends in {kind}")
     # End-to-end heads give no gradient to boxes they drop.
     if getattr(head, "end2end", False):
         head.end2end = False
-    settings = {"multiple": _ULTRALYTICS_STRIDE, "format": "yolov8"} | load_settings(path, spec)
+    settings = {"multiple": _ULTRALYTICS_STRIDE, "format": "yolov8"} | own
     return NetworkDetector(path.stem, _FirstOutput(model.float().eval()), settings, names, where=str(path))
 
 

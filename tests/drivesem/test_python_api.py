@@ -266,6 +266,46 @@ class Blobs(torch.nn.Module):
         return boxes, torch.stack((dark, -dark), -1).sigmoid()
 
 
+class OwnNetwork(torch.nn.Module):
+    """The bundled network as somebody else's: boxes (1, A, 4) px and probabilities (1, A, C)."""
+
+    def __init__(self, through_numpy: bool) -> None:
+        super().__init__()
+        self.inner = ds.load_detector("squeezedet")
+        self.spec = {"classes": list(self.inner.classes)}
+        self.through_numpy = through_numpy
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        if self.through_numpy:
+            images = torch.from_numpy(images.numpy())
+        found = self.inner.candidates(self.inner(images))
+        best = found.log_scores.amax(1).topk(200).indices
+        return found.boxes_xyxy[None, best, 0], found.log_scores[None, best].exp()
+
+
+def test_a_module_is_attacked_by_its_gradient(scene: ds.Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    found = ds.attack(
+        scene, OwnNetwork(through_numpy=False), params="color", steps=1, confirm=False, nuisances="off"
+    )
+    assert found.config.method == "si-fgsm"
+    assert len(found.result.found_before) > 2
+    assert found.result.loss_trace[-1] > found.result.loss_trace[0]
+    assert "gradient" not in capsys.readouterr().err
+
+
+def test_a_module_without_gradient_is_attacked_without_one(
+    scene: ds.Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = ds.attack(
+        scene, OwnNetwork(through_numpy=True), params="color", passes=24, confirm=False, nuisances="off"
+    )
+    assert found.config.method == "climb"
+    assert any(found.theta.values())
+    reason = "its outputs do not depend on the image by torch's operations"
+    line = f"OwnNetwork has no gradient ({reason}): method climb takes the place of si-fgsm"
+    assert line in capsys.readouterr().err.splitlines()
+
+
 def test_edits_are_the_commands(scene: ds.Scene, tmp_path: Path) -> None:
     scene.save(tmp_path / "scene")
     loaded = ds.load_scene(tmp_path / "scene")  # tensors' layout in memory decides how fog's last bits are rounded
