@@ -30,6 +30,7 @@ from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.meshes.load import load_mesh, save_mesh
 from scene_ir.types import (
+    DAYLIGHT_DIM,
     FOLIAGE_DIM,
     LATTICE_POINTS,
     LIGHT_DIM,
@@ -66,6 +67,7 @@ _OBJECT_FIELDS: dict[str, tuple[int, ...]] = {
     "box2d": (4,),
     "truncation": (),
     "occlusion": (),
+    "lamps": (),
 }
 _LABEL_FIELDS: dict[str, tuple[int, ...]] = {
     "boxes_xyxy": (4,),
@@ -184,13 +186,19 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             **{
                 name: objects_node[name].tensor(count, *shape, integer=name in _INTEGERS)
                 for name, shape in _OBJECT_FIELDS.items()
+                if name != "lamps" or name in objects_node.mapping()  # scenes saved before there were any
             },
             source=sources,
         )
     )
     environment = environment_node.build(
         lambda: Environment(
-            **{name: environment_node[name].tensor(width) for name, width in _ENVIRONMENT_FIELDS.items()},
+            **{
+                name: environment_node[name].tensor(
+                    DAYLIGHT_DIM if name == "weather" and environment_node[name].rows() == DAYLIGHT_DIM else width
+                )
+                for name, width in _ENVIRONMENT_FIELDS.items()
+            },
             **{name: arrays.tensor(name, *size) for name in _MAPS},
         )
     )

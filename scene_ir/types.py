@@ -22,12 +22,25 @@ LATTICE = (4, 4, 4)
 LATTICE_POINTS = LATTICE[0] * LATTICE[1] * LATTICE[2]
 TEXTURE_DIM = 5
 """Texture code: lightness, a*, b*, gloss, dirt."""
-WEATHER_DIM = 4
-"""Weather code: fog, rain, time of day, overcast."""
 LIGHT_DIM = 3
 """Light code: the sun's azimuth (to the right), elevation (up), strength."""
 FOLIAGE_DIM = 3
 """Foliage code: hue (season), lightness, density."""
+
+
+class Weather(IntEnum):
+    """Codes of `Environment.weather` by index; each in [0, 1], and 0 as photographed."""
+
+    FOG = 0
+    RAIN = 1
+    TIME = 2
+    OVERCAST = 3
+    NIGHT = 4
+
+
+WEATHER_DIM = len(Weather)
+DAYLIGHT_DIM = int(Weather.NIGHT)
+"""Codes before `NIGHT`: the paper's, and those of scenes saved before there was a night."""
 
 
 class Part(IntEnum):
@@ -260,6 +273,8 @@ class Objects:
     """(N,) int64, 0 to 3, as labelled."""
     source: tuple[Source, ...] = ()
     """One `Source` per object; empty if there is no photograph."""
+    lamps: Tensor = field(default_factory=lambda: torch.zeros(0))
+    """(N,) in [-1, 1]: 0 as the weather makes drivers do it, -1 off, 1 with brake lamps too. Empty is 0 for all."""
 
     def __post_init__(self) -> None:
         n = self.translation.shape[0] if isinstance(self.translation, Tensor) and self.translation.ndim else -1
@@ -273,7 +288,10 @@ class Objects:
         check_shape("objects.box2d", self.box2d, n, 4)
         check_shape("objects.truncation", self.truncation, n)
         check_shape("objects.occlusion", self.occlusion, n, floating=False)
-        for name in ("translation", "yaw", "size_lhw", "ffd", "texture_code"):
+        if isinstance(self.lamps, Tensor) and self.lamps.shape == (0,):
+            object.__setattr__(self, "lamps", self.translation.new_zeros(max(n, 0)))
+        check_shape("objects.lamps", self.lamps, n)
+        for name in ("translation", "yaw", "size_lhw", "ffd", "texture_code", "lamps"):
             check_finite(f"objects.{name}", getattr(self, name))
         if n and float(self.size_lhw.detach().min()) <= 0:
             raise RangeError("objects.size_lhw", "positive metres", float(self.size_lhw.detach().min()))
@@ -289,7 +307,7 @@ class Environment:
     """Codes and maps of the surroundings."""
 
     weather: Tensor
-    """(4,) in [0, 1]; 0 is as photographed."""
+    """(5,) in [0, 1], see `Weather`; 0 is as photographed. (4,), the codes of daylight, is night 0."""
     foliage: Tensor
     """(3,) in [-1, 1]; 0 is as photographed."""
     sun: Tensor
@@ -306,6 +324,9 @@ class Environment:
     """(3,) in [-1, 1]; 0 is as photographed."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.weather, Tensor) and self.weather.shape == (DAYLIGHT_DIM,):
+            weather = torch.nn.functional.pad(self.weather, (0, WEATHER_DIM - DAYLIGHT_DIM))
+            object.__setattr__(self, "weather", weather)
         check_shape("environment.weather", self.weather, WEATHER_DIM)
         check_shape("environment.foliage", self.foliage, FOLIAGE_DIM)
         check_shape("environment.light", self.light, LIGHT_DIM)
@@ -417,6 +438,7 @@ class SceneIR:
             size_lhw=torch.stack([s.size_lhw for s in source]),
             ffd=torch.stack([s.ffd for s in source]),
             texture_code=torch.zeros_like(self.objects.texture_code),
+            lamps=torch.zeros_like(self.objects.lamps),
         )
         environment = replace(
             self.environment,

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from detectors.base import Predictor
 from detectors.types import CLASSES, Detections, Targets
-from drivesem.attacks.budgets import change_limits, parse_budget
+from drivesem.attacks.budgets import budget_for_coordinates, change_limits, parse_budget
 from drivesem.attacks.feasibility_check import ChangeLimits, check_limits, check_scene
 from drivesem.attacks.labels import Difficulty, Labeller, SceneLabels, to_kitti_labels
 from drivesem.attacks.space import Budget, Parameter, ParameterSpace, Parametrisation
@@ -689,7 +689,7 @@ BOUND = 1e-6
 """Tolerance of theta's bounds, in its units: above float32 rounding, below a sign step."""
 SCENE = 1e-5
 """Tolerance between the scene that theta gives and the saved one (m, rad, unit boxes, codes)."""
-_MOVED = ("translation", "yaw", "ffd", "size_lhw", "texture_code")
+_MOVED = ("translation", "yaw", "ffd", "size_lhw", "texture_code", "lamps")
 _CODES = ("weather", "foliage", "light")
 
 
@@ -726,7 +726,8 @@ def check_change(
         if c.name in written:
             expected = {"value": c.value, "unit": c.unit, "bounds": [c.lower, c.upper], "display": c.display}
             log.compare("theta", f"{THETA}: {c.name}", expected, written[c.name])
-    space = ParameterSpace(base, params, budget, parametrisation=parametrisation)
+    recorded = budget_for_coordinates(budget, [c.name for c in result.theta])
+    space = ParameterSpace(base, params, recorded, parametrisation=parametrisation)
     names = [space.name(i) for i in range(space.dim)]
     log.compare("theta", "coordinates", [c.name for c in result.theta], names)
     if len(result.theta) != space.dim:

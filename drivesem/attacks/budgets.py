@@ -7,12 +7,13 @@ A YAML file names the parameters with tighter limits than the paper's budget:
     rotate: 5deg        # a bare number is in rad
     mesh: 0.1           # unit boxes
     color: 0.5          # codes, like weather and foliage
+    night: 0.5          # the code of night alone, with street; 0 leaves night out
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -39,10 +40,21 @@ PRESETS: Mapping[str, Budget] = {
     PARKING: Budget(translate_m=0.5, rotate=math.radians(5)),
     # As far as renders of moved cars are realistic: docs/guide/attack.md has the measurement.
     STREET: Budget(
-        translate=1.5, translate_m=4.0, across_m=1.0, distance_share=0.3, partly_visible=0.25, size=0.1, sun=1.0
+        translate=1.5,
+        translate_m=4.0,
+        across_m=1.0,
+        distance_share=0.3,
+        partly_visible=0.25,
+        size=0.1,
+        sun=1.0,
+        night=1.0,
+        lamps=1.0,
     ),
 }
-_UNITS: Mapping[Parameter, Mapping[str, float]] = {
+_NIGHT = "night"
+_LIMITS = (*(p.value for p in Parameter), _NIGHT)
+"""Limits that a text can set."""
+_UNITS: Mapping[str, Mapping[str, float]] = {
     Parameter.TRANSLATE: LENGTH_UNITS,
     Parameter.ROTATE: ANGLE_UNITS,
     Parameter.SIZE: FRACTION_UNITS,
@@ -82,6 +94,11 @@ def resolve_parameters(config: AttackConfig) -> tuple[Parameter, ...]:
     return params
 
 
+def budget_for_coordinates(budget: Budget, names: Sequence[str]) -> Budget:
+    """The budget of a recorded theta with these coordinates: runs made before there was a night have none."""
+    return budget if any(name.endswith(f".{_NIGHT}") for name in names) else replace(budget, night=0.0)
+
+
 def change_limits(budget: Budget, parametrisation: Parametrisation = "ground") -> ChangeLimits:
     """A budget as the independent feasibility check takes it."""
     return ChangeLimits(**asdict(budget), roi=parametrisation == "roi")
@@ -98,7 +115,7 @@ def format_budget(budget: Budget) -> str:
     elif budget.translate != PRESETS[PAPER].translate and budget.translate_m == PRESETS[PARKING].translate_m:
         preset = PARKING  # its limit in metres stays besides own lengths; a text has only one of the two
     widest = PRESETS[preset]
-    changed = [p.value for p in Parameter if getattr(budget, p.value) != getattr(widest, p.value)]
+    changed = [name for name in _LIMITS if getattr(budget, name) != getattr(widest, name)]
     parts = {name: repr(getattr(budget, name)) for name in changed}
     if budget.translate_m != widest.translate_m:
         parts[Parameter.TRANSLATE.value] = f"{budget.translate_m!r}m"
@@ -116,21 +133,20 @@ def _parse_value(text: str) -> float | str:
 
 def _narrow_budget(where: str, content: Any, preset: Budget = PRESETS[PAPER]) -> Budget:
     """The preset, narrowed by the entries of `content`; no limit may exceed the preset's."""
-    entry = require_mapping(where, content, [p.value for p in Parameter])
+    entry = require_mapping(where, content, _LIMITS)
     limits: dict[str, float] = {}
     for name, value in entry.items():
-        parameter = Parameter(name)
-        units = _UNITS.get(parameter)
+        units = _UNITS.get(name)
         if units is not None and isinstance(value, str):
             limit = parse_measure(f"{where}: {name}", value, units)
-            key = "translate_m" if parameter is Parameter.TRANSLATE else name
+            key = "translate_m" if name == Parameter.TRANSLATE else name
         else:
             limit, key = parse_finite_number(f"{where}: {name}", value), name
         widest = getattr(preset, key)
         if widest == 0:
             expected = f"{STREET},{name}={value}, since only {STREET} lets it change"
             raise FormatError(f"{where}: {name}", expected, value)
-        if not 0 < limit <= widest:
+        if not (0 < limit <= widest or (name == _NIGHT and limit == 0)):
             maximum = "" if widest == math.inf else f" of at most {widest:g}"
             raise FormatError(f"{where}: {name}", f"a positive number{maximum}", value)
         limits[key] = limit

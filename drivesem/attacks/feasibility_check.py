@@ -61,6 +61,8 @@ MINIMUM_PX = 8.0
 MINIMUM_TOLERANCE_PX = 1.0
 WEATHER_TOLERANCE = 0.01
 """Tolerance of weather codes and their limits."""
+_NIGHT = 4
+"""Index of night's code."""
 RAIN_UNDER_CLEAR_SKY = 0.5
 """Maximum code of rain under a sky as bright as photographed: a shower."""
 DAYLIGHT_LX, TWILIGHT_LX = 15_000.0, 3.4
@@ -107,6 +109,10 @@ class ChangeLimits:
     size: float = 0.0
     """Share of the size, of a car that is neither hidden nor truncated."""
     sun: float = 0.0
+    """Code, absolute."""
+    night: float = 0.0
+    """Code of night."""
+    lamps: float = 0.0
     """Code, absolute."""
     roi: bool = False
     """Whether `translate` uses the parametrisation of 3D-SDN."""
@@ -340,7 +346,14 @@ def _code_violations(base: SceneIR, perturbed: SceneIR, limits: ChangeLimits) ->
     (old, before), (new, after) = ((scene.objects, scene.environment) for scene in (base, perturbed))
     ranges = {
         "objects.texture_code": (old.texture_code, new.texture_code, -limits.color, limits.color),
-        "environment.weather": (before.weather, after.weather, 0.0, limits.weather),
+        "objects.lamps": (old.lamps, new.lamps, -limits.lamps, limits.lamps),
+        "environment.weather": (before.weather[:_NIGHT], after.weather[:_NIGHT], 0.0, limits.weather),
+        "environment.night": (
+            before.weather[_NIGHT:],
+            after.weather[_NIGHT:],
+            0.0,
+            min(limits.weather, limits.night),
+        ),
         "environment.foliage": (before.foliage, after.foliage, -limits.foliage, limits.foliage),
         "environment.light": (before.light, after.light, -limits.sun, limits.sun),
     }
@@ -362,6 +375,8 @@ def _weather_violations(base: SceneIR, perturbed: SceneIR) -> list[str]:
         violations.append(f"weather: rain {after.rain:.2f} out of a sky covered {after.overcast:.2f}")
     if after.light_lx < min(TWILIGHT_LX, before.light_lx) * (1 - 5 * WEATHER_TOLERANCE):
         violations.append(f"weather: {after.light_lx:.1f} lx, darker than at the end of civil twilight")
+    if after.time + after.night > max(1.0, before.time + before.night) + WEATHER_TOLERANCE:
+        violations.append(f"weather: dusk {after.time:.2f} at night {after.night:.2f}")
     return violations
 
 
@@ -373,15 +388,18 @@ class _Sky:
     rain: float
     time: float
     overcast: float
+    night: float
 
     @property
     def light_lx(self) -> float:
-        """Illuminance of the road. Overcast, fog and rain each take nine tenths."""
+        """Daylight on the road, before night. Overcast, fog and rain each take nine tenths."""
         dusk = (TWILIGHT_LX / DAYLIGHT_LX) ** self.time
         return DAYLIGHT_LX * dusk * 0.1 ** (self.fog + self.rain + self.overcast)
 
     def dimmed(self, tones: Array, air: float, away_m: float) -> Array:
-        """Display values as they appear at a distance, where the air has the display value `air`."""
+        """Display values as they appear at a distance, where the air has the display value `air`. Night hides no car:
+        its lamps are lit.
+        """
         clear = math.exp(-away_m * (EXTINCTION_PER_M[0] * self.fog + EXTINCTION_PER_M[1] * self.rain))
         return (clear * tones + (1 - clear) * air) * math.exp(-DIMMING * self.time**2)
 

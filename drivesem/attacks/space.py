@@ -20,7 +20,16 @@ from drivesem.attacks.theta import ParameterSpec, ThetaSpace, lattice_names, sel
 from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import clamp_inclusive, yaw_matrix
-from scene_ir.types import FOLIAGE_DIM, LATTICE, LIGHT_DIM, TEXTURE_DIM, WEATHER_DIM, SceneIR
+from scene_ir.types import (
+    DAYLIGHT_DIM,
+    FOLIAGE_DIM,
+    LATTICE,
+    LIGHT_DIM,
+    TEXTURE_DIM,
+    WEATHER_DIM,
+    SceneIR,
+    Weather,
+)
 
 ROI_DIM = 3
 """Offset right and down, in region widths and heights; log depth."""
@@ -123,22 +132,27 @@ class Parameter(StrEnum):
     MESH = "mesh"
     SIZE = "size"
     SUN = "sun"
+    LAMPS = "lamps"
 
 
-PAPER_PARAMETERS = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN))
+PAPER_PARAMETERS = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN, Parameter.LAMPS))
 """The paper's parameters. The others need a budget beyond the paper's."""
 
 
 _HALF_LATTICE = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
 """Independent half of the lattice; the other half mirrors it."""
 
+_WEATHER_NAMES = tuple(
+    f"weather.{'time_of_day' if code is Weather.TIME else code.name.lower()}" for code in Weather
+)
+_DAYLIGHT = ParameterSpec(DAYLIGHT_DIM, False, "code", _WEATHER_NAMES[:DAYLIGHT_DIM])
+"""Weather where the budget has no night: the paper's four codes."""
+
 SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.COLOR: ParameterSpec(
         TEXTURE_DIM, True, "code", tuple(f"paint.{n}" for n in ("lightness", "a", "b", "gloss", "dirt"))
     ),
-    Parameter.WEATHER: ParameterSpec(
-        WEATHER_DIM, False, "code", tuple(f"weather.{n}" for n in ("fog", "rain", "time_of_day", "overcast"))
-    ),
+    Parameter.WEATHER: ParameterSpec(WEATHER_DIM, False, "code", _WEATHER_NAMES),
     Parameter.FOLIAGE: ParameterSpec(
         FOLIAGE_DIM, False, "code", tuple(f"foliage.{n}" for n in ("hue", "lightness", "density"))
     ),
@@ -149,6 +163,7 @@ SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.SUN: ParameterSpec(
         LIGHT_DIM, False, "code", tuple(f"sun.{n}" for n in ("azimuth", "elevation", "strength"))
     ),
+    Parameter.LAMPS: ParameterSpec(1, True, "code", ("lamps",)),
 }
 
 Parametrisation = Literal["ground", "roi"]
@@ -193,6 +208,10 @@ class Budget:
     theirs."""
     sun: float = 0.0
     """Code, absolute; 0 fixes it."""
+    night: float = 0.0
+    """Code of night, as far as `weather` allows it too; 0 leaves it out of theta."""
+    lamps: float = 0.0
+    """Code, absolute; 0 fixes it."""
     translate_m: float = math.inf
     """Metres, along and across, the same for long and short vehicles."""
     across_m: float = math.inf
@@ -204,7 +223,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         unbounded = ("translate_m", "across_m", "distance_share", "partly_visible")
-        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun"))
+        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun", "night", "lamps"))
 
     def check(self, params: Iterable[Parameter], parametrisation: Parametrisation = "ground") -> None:
         """Raise FormatError for a parameter that this budget fixes, or for a budget in metres with `roi`."""
@@ -221,7 +240,7 @@ class Budget:
 @dataclass(frozen=True, slots=True)
 class StepSizes:
     """The step alpha of each parameter, in theta's units: the paper's; size steps like translate, sun like
-    foliage.
+    foliage, lamps like weather.
     """
 
     color: float = 0.05
@@ -239,6 +258,8 @@ class StepSizes:
     size: float = 0.01
     """Share of the vehicle's size."""
     sun: float = 0.10
+    """Code."""
+    lamps: float = 0.25
     """Code."""
 
     def __post_init__(self) -> None:
@@ -262,7 +283,7 @@ class Perturbation:
     color: Tensor | None = None
     """(N, 5), codes."""
     weather: Tensor | None = None
-    """(4,), codes."""
+    """(5,), codes; (4,) where the budget has no night."""
     foliage: Tensor | None = None
     """(3,), codes."""
     translate: Tensor | None = None
@@ -275,6 +296,8 @@ class Perturbation:
     """(N, 1), share of the own size."""
     sun: Tensor | None = None
     """(3,), codes."""
+    lamps: Tensor | None = None
+    """(N, 1), codes."""
 
     @classmethod
     def between(cls, photographed: SceneIR, scene: SceneIR) -> Perturbation:
@@ -291,6 +314,7 @@ class Perturbation:
             mesh=ffd.to_symmetric(now.ffd - before.ffd),
             size=now.size_lhw[:, :1] / before.size_lhw[:, :1] - 1,
             sun=environment.light.to(before.yaw),
+            lamps=now.lamps[:, None],
         )
 
 
@@ -333,13 +357,14 @@ class ParameterSpace(ThetaSpace[Parameter]):
         Raises:
             FormatError: the budget fixes one of the parameters.
         """
+        self.budget = budget or Budget()
         specs = SPECS | {Parameter.TRANSLATE: _ROI_TRANSLATE} if parametrisation == "roi" else SPECS
+        specs = specs if self.budget.night else specs | {Parameter.WEATHER: _DAYLIGHT}
         super().__init__(
             select_parameters(Parameter, params), specs, len(scene.objects), scene.objects.translation
         )
         self.scene = scene
         self.parametrisation: Parametrisation = parametrisation
-        self.budget = budget or Budget()
         self.budget.check(self.params, parametrisation)
         self.steps = steps or StepSizes()
         # Constant: no gradient flows to the photographed scene.
@@ -401,16 +426,27 @@ class ParameterSpace(ThetaSpace[Parameter]):
         budget = self.budget
         if part.color is not None:
             changes["texture_code"] = _clamp_code(objects.texture_code, part.color, -budget.color, budget.color)
+        if part.lamps is not None:
+            changes["lamps"] = _clamp_code(objects.lamps, part.lamps[:, 0], -budget.lamps, budget.lamps)
         if changes:
             scene = scene.with_objects(**changes)
         codes: dict[str, Tensor] = {}
         if part.weather is not None:
-            codes["weather"] = _clamp_code(environment.weather, part.weather, 0.0, budget.weather)
+            start = environment.weather
+            changed = _clamp_code(
+                start[: len(part.weather)], part.weather, 0.0, self._weather_limits(part.weather)
+            )
+            codes["weather"] = torch.cat([changed, start[len(part.weather) :].to(changed)])
         if part.foliage is not None:
             codes["foliage"] = _clamp_code(environment.foliage, part.foliage, -budget.foliage, budget.foliage)
         if part.sun is not None:
             codes["light"] = _clamp_code(environment.light.to(part.sun), part.sun, -budget.sun, budget.sun)
         return scene.with_environment(**codes) if codes else scene
+
+    def _weather_limits(self, codes: Tensor) -> Tensor:
+        """Upper bounds of weather codes (4,) or (5,)."""
+        limits = [self.budget.weather] * DAYLIGHT_DIM + [min(self.budget.weather, self.budget.night)]
+        return codes.new_tensor(limits)[: len(codes)]
 
     def _shift_m(self, scene: SceneIR, translate: Tensor) -> Tensor:
         """Shift (N, 3) m caused by translate's block."""
@@ -451,8 +487,11 @@ class ParameterSpace(ThetaSpace[Parameter]):
         limit = getattr(self.budget, parameter.value)
         if parameter is Parameter.COLOR:
             start, low = self.scene.objects.texture_code.reshape(-1), -limit
+        elif parameter is Parameter.LAMPS:
+            start, low = self.scene.objects.lamps, -limit
         elif parameter is Parameter.WEATHER:
-            start, low = self.scene.environment.weather, 0.0
+            start, low = self.scene.environment.weather[: self.specs[parameter].size], 0.0
+            limit = self._weather_limits(start)
         elif parameter is Parameter.FOLIAGE:
             start, low = self.scene.environment.foliage, -limit
         elif parameter is Parameter.SUN:

@@ -2,13 +2,14 @@
 
 An edit of one frame, as YAML or as nested mappings:
 
-    weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast; or a name, such as sunset
+    weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast, night; or a name, such as sunset
     foliage: {hue: 0.4}             # codes in [-1, 1]: hue, lightness, density
     sun: {azimuth: -0.5}            # codes in [-1, 1]: azimuth, elevation, strength
     objects:
       2: {translate: [0.5m, 0m], rotate: 10deg}
       4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
       3: {size: 5%}                 # larger by so much, on its wheels; -5% is smaller
+      1: {lamps: brake}             # off, auto (as the weather makes drivers do it), brake, or a code in [-1, 1]
       6: {mesh: 60%}                # drivesem edit --photographed: of the shape that the scene's vehicle has
       5: {remove: true}
       all: {rotate: 0.05}
@@ -16,7 +17,7 @@ An edit of one frame, as YAML or as nested mappings:
 translate is along the vehicle's length and across to its left (+z of its own axes), on the ground; rotate is about
 its ground centre. Text needs a unit: m, deg, rad or %. A bare number of a YAML file is in theta's units: own
 lengths, rad, shares. On the command line everything is text: `objects[2].translate=0.5m,0m`, `weather=fog`,
-`weather.rain=0.4`.
+`weather=fog=0.6,night=1`, `weather.rain=0.4`.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from typing import Any
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
-from scene_ir.types import TEXTURE_DIM
+from scene_ir.types import TEXTURE_DIM, Weather
 
 ALL = "all"
-WEATHER_CODES = ("fog", "rain", "time", "overcast")
+WEATHER_CODES = tuple(code.name.lower() for code in Weather)
 FOLIAGE_CODES = ("hue", "lightness", "density")
 SUN_CODES = ("azimuth", "elevation", "strength")
 WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
@@ -43,9 +44,12 @@ WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "sunset": {"time": 0.5},
     "overcast": {"overcast": 1.0},
     "twilight": {"time": 1.0},
+    "night": {"night": 1.0, "overcast": 0.3},
 }
 """Weather codes by name; all others are 0."""
-OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "remove")
+OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "lamps", "remove")
+LAMPS: Mapping[str, float] = {"off": -1.0, "auto": 0.0, "brake": 1.0}
+"""Codes of lamps by name."""
 FRAME_KEYS = ("objects", "weather", "foliage", "sun")
 LENGTH_UNITS = {"m": 1.0}
 ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
@@ -76,12 +80,16 @@ class ObjectEdit:
     """Whether the vehicle and its shadow are removed."""
     mesh_fraction: float = 0.0
     """Fraction, 0 to 1, of the deformation that the scene already has."""
+    lamps: float = 0.0
+    """Code of the lamps, in [-1, 1]."""
 
     def __post_init__(self) -> None:
         if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
             raise RangeError("edit color", f"{TEXTURE_DIM} codes in [-1, 1]", list(self.color))
         if len(self.mesh) not in (0, SYMMETRIC_DIM):
             raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
+        if not -1 <= self.lamps <= 1:
+            raise RangeError("edit lamps", f"{', '.join(LAMPS)}, or a code in [-1, 1]", self.lamps)
         if not abs(self.size) <= MAX_SIZE_CHANGE:
             raise RangeError("edit size", f"a change of at most {MAX_SIZE_CHANGE:.0%} either way", self.size)
         if not 0 <= self.mesh_fraction <= 1:
@@ -95,7 +103,7 @@ class FrameEdit:
     objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
     """Changes of vehicles by track (generated streets) or row (scenes), or of "all"."""
     weather: tuple[float, ...] = (0.0,) * len(WEATHER_CODES)
-    """Weather codes (4,), in [0, 1]."""
+    """Weather codes (5,), in [0, 1]."""
     foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_CODES)
     """Foliage codes (3,), in [-1, 1]."""
     sun: tuple[float, ...] = (0.0,) * len(SUN_CODES)
@@ -172,25 +180,32 @@ def merge_edits(first: Mapping[Any, Any], second: Mapping[Any, Any]) -> dict[Any
 
 
 def _weather(value: Any) -> Any:
-    """A weather's name as all its codes, so that they replace earlier ones."""
-    if not isinstance(value, str) or value not in WEATHER_PRESETS:
+    """A weather's name, or amounts such as "fog=0.6,night=1", as all codes, so that they replace earlier ones."""
+    if not isinstance(value, str):
         return value
-    return {**dict.fromkeys(WEATHER_CODES, 0.0), **WEATHER_PRESETS[value]}
+    named = WEATHER_PRESETS.get(value)
+    if named is None:
+        pairs = [part.partition("=") for part in value.split(",")]
+        if not all(equals for _, equals, _ in pairs):
+            return value
+        named = {name.strip(): amount.strip() for name, _, amount in pairs}
+    return {**dict.fromkeys(WEATHER_CODES, 0.0), **named}
 
 
 def parse_frame_edit(where: str, value: Any) -> FrameEdit:
     """The edit that nested mappings describe. Raises FormatError with `where` and the place in them."""
     entry = require_mapping(where, value, FRAME_KEYS)
     objects = require_mapping(f"{where}: objects", entry.get("objects") or {})
-    weather = entry.get("weather")
-    if isinstance(weather, str) and weather not in WEATHER_PRESETS:
-        raise FormatError(f"{where}: weather", f"codes, or one of {', '.join(WEATHER_PRESETS)}", repr(weather))
+    weather = _weather(entry.get("weather"))
+    if isinstance(weather, str):
+        expected = f"codes such as fog=0.6,night=1, or one of {', '.join(WEATHER_PRESETS)}"
+        raise FormatError(f"{where}: weather", expected, repr(weather))
     return FrameEdit(
         objects={
             _number_or_all(f"{where}: objects", key): _object_edit(f"{where}: object {key}", edit)
             for key, edit in objects.items()
         },
-        weather=_codes(f"{where}: weather", _weather(weather), WEATHER_CODES, 0.0),
+        weather=_codes(f"{where}: weather", weather, WEATHER_CODES, 0.0),
         foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_CODES, -1.0),
         sun=_codes(f"{where}: sun", entry.get("sun"), SUN_CODES, -1.0),
     )
@@ -221,9 +236,20 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
             size=_fraction(f"{where}: size", entry.get("size", 0)),
             remove=remove,
             mesh_fraction=share,
+            lamps=_lamps(f"{where}: lamps", entry.get("lamps", 0.0)),
         )
     except RangeError as error:
         raise FormatError(where, error.expected, error.actual) from error
+
+
+def _lamps(where: str, value: Any) -> float:
+    # YAML reads off as false
+    if value is False or (isinstance(value, str) and value in LAMPS):
+        return LAMPS["off" if value is False else value]
+    try:
+        return parse_finite_number(where, value)
+    except FormatError as error:
+        raise FormatError(where, f"{', '.join(LAMPS)}, or a code in [-1, 1]", error.actual) from error
 
 
 def require_mapping(where: str, value: Any, known: Sequence[str] | None = None) -> dict[Any, Any]:

@@ -17,7 +17,7 @@ from detectors.planted import compute_features
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.methods.margin_search import UnitBox
 from drivesem.attacks.objective import Objective
-from drivesem.attacks.space import SPECS, Parameter
+from drivesem.attacks.space import Parameter
 from drivesem.failures.certificate import (
     CompositorRenderer,
     NuisanceCamera,
@@ -231,10 +231,11 @@ def describe_object(objective: Objective, scene: SceneIR, image: SampleImage, in
         Parameter.WEATHER: environment.weather,
         Parameter.FOLIAGE: environment.foliage,
         Parameter.SUN: environment.light,
+        Parameter.LAMPS: objects.lamps[index : index + 1],
     }
     for parameter, values in codes.items():
         if parameter in space.params:
-            features |= dict(zip(SPECS[parameter].names, values.tolist(), strict=True))
+            features |= dict(zip(space.specs[parameter].names, values.tolist(), strict=False))
     if Parameter.TRANSLATE in space.params:
         features["moved_m"] = float((objects.translation[index] - space.scene.objects.translation[index]).norm())
     if Parameter.SIZE in space.params:

@@ -121,7 +121,7 @@ class Nuisances:
 
         camera = uniform(7).tolist()
         position, angle, size = uniform(count, 2), uniform(count), uniform(count)
-        paint, weather, foliage = uniform(count, 5), uniform(4), uniform(3)
+        paint, daylight, foliage, night = uniform(count, 5), uniform(4), uniform(3), uniform(1)
         quality = self.jpeg + (_MAX_JPEG_QUALITY - self.jpeg) * (camera[6] + 1) / 2
         return NuisanceSample(
             hw=hw,
@@ -137,7 +137,7 @@ class Nuisances:
             angle=math.radians(self.angle_deg) * angle,
             size=self.size * size,
             paint=self.code * paint,
-            weather=self.code * weather,
+            weather=self.code * torch.cat([daylight, night]),
             foliage=self.code * foliage,
         )
 
@@ -189,7 +189,7 @@ class NuisanceSample:
     paint: Tensor
     """(N, 5) changes of texture codes."""
     weather: Tensor
-    """(4,) changes of the weather code."""
+    """(5,) changes of the weather code."""
     foliage: Tensor
     """(3,) changes of the foliage code."""
 

@@ -222,7 +222,7 @@ def attack(
             of images (`ds.load_detector`). An object excludes the options `precision` and `tiles`, and any device but
             its own. A detector without gradient is attacked by climb unless another method is given; a line on standard
             error names the reason.
-        params: Parameters of theta with commas: color, weather, foliage, translate, rotate, mesh, size, sun.
+        params: Parameters of theta with commas: color, weather, foliage, translate, rotate, mesh, size, sun, lamps.
         combo: Combination of the paper instead of `params`: 1 translate+rotate, 2 translate+rotate+mesh (the
             default), 3 translate+mesh, 4 rotate+mesh.
         budget: Limits of the change: paper, parking, street, or limits such as "translate=0.1".

@@ -17,7 +17,7 @@ from torch import Tensor
 from detectors import boxes
 from detectors.base import Predictor, detector_device
 from detectors.registry import ONNX, ONNX_RUNTIME
-from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.budgets import budget_for_coordinates, parse_budget
 from drivesem.attacks.feasible.constraints import FeasibilityLimits
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.labels import Difficulty
@@ -242,8 +242,10 @@ def rebuild_objective(
         FormatError: The scene or theta is damaged.
     """
     scene = convert_scene(load_scene(folder / "scene").unperturbed(), None, detector_device(detector))
-    space = ParameterSpace(scene, params, parse_budget(attack.budget), parametrisation=attack.parametrisation)
-    if [c.name for c in result.theta] != [space.name(i) for i in range(space.dim)]:
+    names = [c.name for c in result.theta]
+    budget = budget_for_coordinates(parse_budget(attack.budget), names)
+    space = ParameterSpace(scene, params, budget, parametrisation=attack.parametrisation)
+    if names != [space.name(i) for i in range(space.dim)]:
         raise FormatError(str(folder / RESULT), f"theta of {', '.join(space.params)}", "other coordinates")
     theta = torch.tensor([c.value for c in result.theta]).to(space.theta0)
     compositor = Compositor(scene, RenderSettings(backend=attack.backend))

@@ -122,9 +122,11 @@ def _under_sun(light: Light, code: tuple[float, ...]) -> Light:
 
 def _weathered(light: Light, code: tuple[float, ...]) -> Light:
     """Light under a weather code: physical counterparts of what the compositor does to the picture."""
-    fog, rain, time, overcast = code
     if not any(code):
         return light
+    fog, rain, time, overcast, night = code
+    if night:
+        raise RangeError("weather.night", "0, since generated streets are drawn by daylight", night)
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
     daylight = (1 + time_gain(torch.tensor(time, dtype=torch.float64)).numpy()) ** _GAMMA

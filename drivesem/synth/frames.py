@@ -34,7 +34,7 @@ from drivesem.synth.view import SUPERSAMPLING, Setting, Shadow, Sight, View, blo
 from drivesem.synth.world import POOLS, actor_soup, surroundings
 from scene_ir.errors import RangeError
 from scene_ir.geometry import project_boxes, yaw_matrix
-from scene_ir.types import Camera, Crop, Environment, Labels
+from scene_ir.types import WEATHER_DIM, Camera, Crop, Environment, Labels
 
 SPLITS = ("train", "heldout")
 VARIANTS = {"train": (0, 100), "heldout": (100, 60)}
@@ -283,7 +283,7 @@ def _environment(sight: Sight, setting: Setting) -> Environment:
     up = view.up
     sky, foliage, road = _shares(sight.material)
     return Environment(
-        weather=torch.zeros(4),
+        weather=torch.zeros(WEATHER_DIM),
         foliage=torch.zeros(3),
         sun=torch.tensor(setting.light.sun, dtype=torch.float32),
         ground=torch.tensor([*up, view.height_m], dtype=torch.float32),

@@ -10,7 +10,7 @@ import torch
 
 from drivesem.synth.soup import Material, Soup
 from scene_ir.render.environment import apply_foliage
-from scene_ir.types import Environment
+from scene_ir.types import WEATHER_DIM, Environment
 
 _GROWTH = 0.35
 """By how much of its size a leaf cluster grows at density 1."""
@@ -47,7 +47,7 @@ def _coloured(albedo: np.ndarray, hue: float, lightness: float) -> np.ndarray:
     display_colour = torch.from_numpy(np.clip(albedo, 0, 1).T[:, None].astype(np.float64)) ** (1 / 2.2)
     row = torch.zeros(display_colour.shape[1:], dtype=torch.float64)
     environment = Environment(
-        weather=row.new_zeros(4),
+        weather=row.new_zeros(WEATHER_DIM),
         foliage=row.new_tensor([hue, lightness, 0.0]),
         sun=row.new_tensor([0.0, -1.0, 0.0]),
         ground=row.new_tensor([0.0, -1.0, 0.0, 1.65]),

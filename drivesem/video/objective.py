@@ -7,7 +7,7 @@ of theta. Their weights sum to one, so a path stays within the bounds of its con
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import comb
 
@@ -53,7 +53,7 @@ class ClipSpace(ThetaSpace[Parameter]):
         self.tracks = tuple(sorted({track for of_frame in tracks for track in of_frame}))
         self.points = bend + 1
         like = spaces[0].scene.objects.translation
-        super().__init__(spaces[0].params, _specs(self.points), len(self.tracks), like)
+        super().__init__(spaces[0].params, _specs(spaces[0].specs, self.points), len(self.tracks), like)
         places = ([self.tracks.index(track) for track in of_frame] for of_frame in tracks)
         self.rows = [torch.tensor(of_frame, dtype=torch.int64, device=like.device) for of_frame in places]
         self._weights = _path_weights(self.tracks, tracks, self.points, like)
@@ -213,11 +213,11 @@ def _renamed(name: str, space: ClipSpace, frame: int) -> str:
     return f"cars[{space.tracks[int(space.rows[frame][int(index)])]}]{rest}"
 
 
-def _specs(points: int) -> dict[Parameter, ParameterSpec]:
+def _specs(specs: Mapping[Parameter, ParameterSpec], points: int) -> dict[Parameter, ParameterSpec]:
     """The specifications of the parameters, for cars instead of objects."""
     names = tuple(f"{name}[{k}]" for k in range(points) for name in SPECS[Parameter.TRANSLATE].names)
     path = ParameterSpec(2 * points, True, SPECS[Parameter.TRANSLATE].unit, names, "cars")
-    return {p: replace(spec, owner="cars") for p, spec in SPECS.items()} | {Parameter.TRANSLATE: path}
+    return {p: replace(spec, owner="cars") for p, spec in specs.items()} | {Parameter.TRANSLATE: path}
 
 
 def _path_weights(cars: Sequence[int], tracks: Sequence[Sequence[int]], points: int, like: Tensor) -> list[Tensor]:

@@ -16,7 +16,6 @@ from typing import Any
 from torch import Tensor
 
 from drivesem.attacks.space import (
-    SPECS,
     Budget,
     Parameter,
     ParameterSpace,
@@ -25,7 +24,7 @@ from drivesem.attacks.space import (
 )
 from drivesem.config.edits import FOLIAGE_CODES, SUN_CODES, WEATHER_CODES
 from scene_ir.errors import RangeError, make_printable
-from scene_ir.types import SceneIR
+from scene_ir.types import SceneIR, Weather
 
 State = Mapping[str, float]
 """Slider values by name, in the slider's unit. A missing name is 0: as photographed."""
@@ -36,7 +35,7 @@ _STEPS = {"m": 0.01, "deg": 0.1, "%": 0.5, "": 0.01}
 _DIGITS = 6
 """Decimals of values, the precision of float32."""
 _SHAPE = "shape"
-_CODES = (Parameter.COLOR, Parameter.WEATHER, Parameter.FOLIAGE, Parameter.SUN)
+_CODES = (Parameter.COLOR, Parameter.WEATHER, Parameter.FOLIAGE, Parameter.SUN, Parameter.LAMPS)
 _SCENE_CODES = {Parameter.WEATHER: WEATHER_CODES, Parameter.FOLIAGE: FOLIAGE_CODES, Parameter.SUN: SUN_CODES}
 
 
@@ -87,6 +86,8 @@ class SceneSliders:
         params = [p for p in Parameter if p is not Parameter.MESH and getattr(budget, p.value) > 0]
         self.space = ParameterSpace(self.rest, params, budget)
         found = replace(found, **{p.value: None for p in Parameter if p not in params})
+        if found.weather is not None:
+            found = replace(found, weather=found.weather[: self.space.specs[Parameter.WEATHER].size])
         self._bent = scene.objects.ffd - self.rest.objects.ffd
         self._places: dict[str, tuple[int, float]] = {}
         self.sliders: dict[str, Slider] = {}
@@ -143,13 +144,13 @@ class SceneSliders:
         """A state as the assignments of `drivesem edit --set`."""
         assignments: dict[str, str] = {}
         for parameter, where in self.space.blocks.items():
-            spec, names = SPECS[parameter], _SCENE_CODES.get(parameter)
+            spec, names = self.space.specs[parameter], _SCENE_CODES.get(parameter)
             for start in range(where.start, where.stop, spec.size):
                 here = [self.space.name(i) for i in range(start, start + spec.size)]
                 values = [state.get(name, 0.0) for name in here]
                 if names is not None:
                     assignments |= {
-                        f"{parameter}.{n}": _format_number(v) for n, v in zip(names, values, strict=True) if v
+                        f"{parameter}.{n}": _format_number(v) for n, v in zip(names, values, strict=False) if v
                     }
                 elif any(values):
                     unit = self.sliders[here[0]].unit
@@ -165,7 +166,7 @@ class SceneSliders:
         lower, upper, values = self.space.lower.tolist(), self.space.upper.tolist(), found.tolist()
         away = behind_camera(self.rest).tolist()
         for parameter, where in self.space.blocks.items():
-            spec = SPECS[parameter]
+            spec = self.space.specs[parameter]
             for i in range(where.start, where.stop):
                 car = (i - where.start) // spec.size if spec.per_object else None
                 factor, unit = self.space.physical(i, 1.0) or (1.0, "")
@@ -188,6 +189,8 @@ def _widen_budget(budget: Budget, found: Perturbation) -> Budget:
         most = float(values.abs().max()) if values.numel() else 0.0
         if most > max(getattr(budget, parameter.value), 1e-6):
             wider[parameter.value] = most
+    if found.weather is not None:
+        wider["night"] = max(budget.night, float(found.weather[Weather.NIGHT]))
     return replace(budget, **wider)
 
 

@@ -11,11 +11,15 @@ from dataclasses import replace
 from functools import cached_property, lru_cache
 
 import torch
+from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, fast, reference
+from scene_ir.render.channels import LIT
 from scene_ir.render.environment import PerturbedSun, apply_foliage, apply_weather, shadow_softening
+from scene_ir.render.lamps import draw_lamps
+from scene_ir.render.night import apply_night
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
 from scene_ir.render.texture import PaintRegions
 from scene_ir.types import Crop, Objects, Render, SceneIR
@@ -66,7 +70,7 @@ class Compositor(PreparedScene):
         objects = perturbed.objects
         if len(objects) != len(self.scene.objects):
             raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
-        names = ("translation", "yaw", "size_lhw", "ffd", "texture_code")
+        names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "lamps")
         return replace(self.scene.objects, **{name: getattr(objects, name).to(self.like) for name in names})
 
     def compose(self, perturbed: SceneIR, objects: Objects, layers: ObjectLayers | None) -> Render:
@@ -78,7 +82,8 @@ class Compositor(PreparedScene):
             layers: Their layers; None without objects.
         """
         environment, backend = perturbed.environment, self.backend
-        weather, foliage = is_active(environment.weather), is_active(environment.foliage)
+        weather = is_active(environment.weather) or is_active(objects.lamps)
+        foliage = is_active(environment.foliage)
         canvas = self.canvas if weather else self.canvas[:3]
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))
@@ -87,6 +92,7 @@ class Compositor(PreparedScene):
             layers = self.occluders.append_to(layers, canvas[:3] - self.canvas[:3] if foliage else None)
         drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)
         behind = self.scene.environment
+        shows: Tensor | None = None
         if layers is None:
             with torch.no_grad():
                 depth = self.scene.depth.clone()
@@ -130,6 +136,12 @@ class Compositor(PreparedScene):
             changed = replace(behind, weather=environment.weather.to(self.like))
             colour, inverse = canvas.split([3, 1])
             image = apply_weather(colour, inverse[0], changed, self.air, backend)
+            lit = self.night_maps.maps[LIT]
+            lit = lit if shows is None else lit * shows
+            lamps = torch.zeros_like(colour)
+            if len(objects):
+                lamps = draw_lamps(self.lamps, self.scene, objects, number, changed, self.centre)
+            image = apply_night(image, inverse[0], changed, lit, lamps, self.night_maps, backend)
         if weather or layers is None:
             image = blend.clamp_colour(image[:3])
         return Render(image, depth, number, opacity, drawn)

@@ -19,7 +19,7 @@ from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
 from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab, smoothstep
-from scene_ir.types import Environment, SceneIR
+from scene_ir.types import DAYLIGHT_DIM, Environment, SceneIR
 
 
 def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
@@ -33,9 +33,8 @@ def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
 
 
 def shadow_softening(weather: Tensor) -> Tensor:
-    """Factor () by which fog, rain, twilight and overcast weaken cast shadows; 1 at code 0. weather: (4,)."""
-    fog, rain, time, overcast = (rate * code for rate, code in zip(model.SHADOW_SOFTENING, weather, strict=True))
-    return torch.exp(-(fog + rain + time + overcast))
+    """Factor () by which weather and night weaken cast shadows; 1 at code 0. weather: (5,)."""
+    return torch.exp(-(weather.new_tensor(model.SHADOW_SOFTENING) * weather).sum())
 
 
 def time_gain(time: Tensor) -> Tensor:
@@ -120,7 +119,8 @@ def _leaves(rgb: Tensor, code: Tensor, maps: Tensor) -> Tensor:
 def apply_weather(
     image: Tensor, inverse_depth: Tensor, environment: Environment, air: Tensor, backend: Backend = "reference"
 ) -> Tensor:
-    """The picture (3, H, W) under `environment.weather`, (4,): fog, rain, time of day, overcast, each in [0, 1].
+    """The picture (3, H, W) under `environment.weather`: fog, rain, time of day, overcast, each in [0, 1]; night is
+    `night.apply_night`.
 
     Differentiable to all, including the maps of sky and road; with backend `warp` (float32, fused) to all but the
     airlight, and to the road only where there is some.
@@ -137,7 +137,7 @@ def apply_weather(
         from scene_ir.render.kernels import effects
 
         return effects.apply_weather(image, inverse_depth, environment, air, streaks)
-    fog, rain, time, overcast = environment.weather.to(image).unbind(-1)
+    fog, rain, time, overcast = environment.weather.to(image)[:DAYLIGHT_DIM]
     sky, road = environment.sky.to(image), environment.road.to(image)
     depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
     luma = image.new_tensor(model.LUMA)

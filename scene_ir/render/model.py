@@ -169,8 +169,8 @@ LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601."""
 SKY_RGB = (0.78, 0.82, 0.87)
 """Colour of the air where the photograph shows no sky."""
-SHADOW_SOFTENING = (0.5, 0.4, 0.5, 0.6)
-"""Rates at which fog, rain, time and overcast weaken cast shadows."""
+SHADOW_SOFTENING = (0.5, 0.4, 0.5, 0.6, 2.0)
+"""Rates at which fog, rain, time, overcast and night weaken cast shadows."""
 OVERCAST = 0.85
 """Weight of the picture under a closed cover at overcast 1."""
 OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.55, 0.88
@@ -214,6 +214,90 @@ at black.
 """
 HAZE_CAP_M = 300.0
 """Haze is a layer on the ground: the sky is seen through this much of it."""
+
+# ---------------------------------------------------------------------------------------------------------- night
+
+NIGHTFALL = 4.0
+"""Rate at which the share of night grows with its code: light falls by about equal factors."""
+STREET_RGB, STREET_BASE = (0.26, 0.19, 0.12), 0.25
+"""Light of street lamps relative to daylight, after the camera's exposure, in the middle of their pools; its share
+between them.
+"""
+ROAD_LIGHT, EXPOSURE = 0.13, (0.4, 1.2)
+"""Light of a photographed road that the headlamps' light is for; it changes in inverse proportion to it, within bounds,
+as a camera's exposure by night does not depend on that by day.
+"""
+BY_DAY = (0.07, 0.12)
+"""Mean light of a photograph that is taken by night, which the code hardly changes, and of one by day."""
+STREET_LAMP_M, STREET_ASIDE_M, STREET_EVERY_M, STREET_FAR_M = 8.0, 7.0, 32.0, 160.0
+"""Height of street lamps; their distance from the camera's path, alternately left and right; and along it, up to
+the farthest.
+"""
+STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 5.0
+"""Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
+GLOW_RGB = (0.0095, 0.0070, 0.0054)
+"""Light of the sky over a town, at the horizon."""
+GLOW_HEIGHT = 0.6
+"""Share of the picture's height over which that glow falls by a factor e."""
+HEAD_RGB, HEAD_FAR_M = (0.60, 0.51, 0.40), 16.0
+"""Light of the own headlamps, relative to daylight, on what is near; distance at which it has fallen to half."""
+SUN_SOFTENED = 1.0
+"""Compression of daylight before street lamps replace it: sunlit surfaces come closer to those in the shade."""
+RETRO_WHITE = 1.5
+"""Growth of the headlamps' light on the brightest surfaces: road markings and number plates send light back."""
+HEAD_AIM, HEAD_SIDE = 0.32, 0.12
+"""Width of the beam, as a tangent, and its share far aside."""
+HEAD_CUT_M, HEAD_SOFT_M, HEAD_ABOVE = 0.9, 0.25, 0.10
+"""Height above the ground at which the beam is cut off, width of that edge, and share of the light above it."""
+RETRO, RETRO_CHROMA = 5.0, (0.30, 0.45)
+"""Gain of the headlamps on signs, which send light back, and the chroma from which an area may be one, and is."""
+LIT_LEVEL, LIT_CONTRAST, LIT_GAIN = (0.80, 0.95), (0.15, 0.35), 1.6
+"""Brightness, and brightness over what surrounds it, from which a small area may be a lamp, and is; gain of its
+light, as the camera opens.
+"""
+LIT_HEIGHT_M = (1.0, 1.5)
+"""Height above the ground from which it may be one, and is: sunlit patches on the ground are none."""
+GLARE = ((0.005, 0.5), (0.018, 0.3), (0.07, 0.10))
+"""Glare of lamps: standard deviations, in heights of the picture, and shares of their light."""
+GLARE_FOG, GLARE_RAIN = 3.0, 1.5
+"""Relative growth of glare at fog 1 and rain 1."""
+CORNER = 0.45
+"""Loss of light at the picture's corners, with the lens wide open."""
+NOISE, NOISE_LEVEL = 0.0025, 0.012
+"""Standard deviation of the noise at black, and its growth with the display value."""
+NIGHT_BEND = 0.02
+"""Display value about which the root that converts night's light to display values bends."""
+
+# --------------------------------------------------------------------------------------------------------- lamps
+
+LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0)
+"""Rates at which fog, rain, time, overcast and night make drivers switch on their lamps."""
+TAIL_LAMP_RGB, HEADLAMP_RGB = (2.4, 0.10, 0.06), (8.0, 7.2, 6.0)
+"""Light of a lamp that faces the camera by night; white is 1."""
+TAIL_CORE = 0.12
+"""Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
+LAMP_STRETCH = (1.5, 0.7)
+"""Width and height of a lamp, relative to its radius."""
+BRAKE_LAMP, LAMP_BEND = 2.5, 6.0
+"""Light of a brake lamp, relative to a tail lamp's; how sharply lamps code 0 separates off from braking."""
+LAMP_BY_DAY = 0.12
+"""The same by daylight, where the exposure is shorter."""
+LAMP_RADIUS_M, LAMP_LEAST_PX = 0.065, 0.6
+"""Radius of a lamp, as the standard deviation of a Gaussian; least such width in the picture."""
+LAMP_FACES = (-0.05, 0.35)
+"""Cosine of a lamp's axis to the direction to the camera from which it shows, and shows fully."""
+HEADLAMP_WIDE = 0.06
+"""Share of a headlamp's light outside of its beam."""
+STREAK, STREAK_SHARE = (0.05, 0.0015), 0.02
+"""Widths of the streak across a lamp, in heights of the picture, and its share of the light."""
+DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH = 0.006, 0.15, 0.45
+"""Share of a lamp's light that a dry and a wet road mirror; length of that image, in distances from the lamp."""
+LAMP_SEARCH = 0.14
+"""Reach of the search for the photograph's own lamp, in widths of the vehicle."""
+TAIL_LAMP_RED, HEADLAMP_WHITE = (0.12, 0.25), (0.70, 0.85)
+"""Excess of red, and least channel, from which a pixel may be, and is, a tail lamp or a headlamp."""
+DRIVEN_ROAD = (0.35, 0.75)
+"""Share of road beyond a vehicle's outer side from which it may drive, and does."""
 
 
 def mirror_reach(height: int) -> int:

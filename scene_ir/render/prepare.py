@@ -24,6 +24,8 @@ from scene_ir.meshes.lod import level_of_detail
 from scene_ir.raster import verbs
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
 from scene_ir.render.environment import PerturbedSun, compute_crown_maps, sky_colour
+from scene_ir.render.lamps import VehicleLamps, find_lamps
+from scene_ir.render.night import NightMaps, compute_night_maps
 from scene_ir.render.surfaces import ObjectSurfaces, TemplateSurface, VertexPlacement
 from scene_ir.render.texture import PaintRegions, PhotographTexels, smoothstep
 from scene_ir.types import Crop, Environment, Objects, SceneIR, convert_scene
@@ -438,6 +440,16 @@ class PreparedScene:
     def crown_maps(self) -> Tensor:
         """Result of `environment.compute_crown_maps`; computed on first use."""
         return compute_crown_maps(self.scene)
+
+    @cached_property
+    def lamps(self) -> VehicleLamps:
+        """Lamps of the vehicles; found on first use."""
+        return find_lamps(self.scene, at_photographed_pose(self.scene.objects), self.centre)
+
+    @cached_property
+    def night_maps(self) -> NightMaps:
+        """Result of `night.compute_night_maps`; computed on first use."""
+        return compute_night_maps(self.scene)
 
     @cached_property
     @torch.no_grad()

@@ -49,7 +49,7 @@ from drivesem.scenes.segmenter import OnnxSegmenter
 from scene_ir import files
 from scene_ir.io import load_scene, save_scene
 from scene_ir.meshes.load import import_mesh, save_mesh
-from scene_ir.types import Camera, Crop, Environment, Labels, Mesh, Objects, Occluder, SceneIR, Source
+from scene_ir.types import WEATHER_DIM, Camera, Crop, Environment, Labels, Mesh, Objects, Occluder, SceneIR, Source
 from tools.experiments.classification.features import PIXEL_ATTACKS
 from tools.experiments.classification.results import ClassificationResults, StudyFacts, StudyNetwork, save_results
 from tools.experiments.classification.study import run_classification_study
@@ -205,7 +205,7 @@ def scene() -> SceneIR:
     )
     empty = torch.zeros(height, width)
     ground, sun = torch.tensor([0.0, -1.0, 0.0, 1.65]), torch.tensor([0.0, -1.0, 0.0])
-    environment = Environment(torch.zeros(4), torch.zeros(3), sun, ground, empty, empty, empty + 1)
+    environment = Environment(torch.zeros(WEATHER_DIM), torch.zeros(3), sun, ground, empty, empty, empty + 1)
     picture = torch.from_numpy(exposure().image).permute(2, 0, 1).float() / 255
     occluders = (Occluder(Crop(torch.full((4, 3, 3), 0.5), 1, 1), 9.0),)
     depth, ignore = torch.full((height, width), 80.0), torch.tensor([[1.0, 2.0, 3.0, 4.0]])

@@ -417,12 +417,12 @@ def _jacobian_and_height(jacobian: Tensor, height: Tensor) -> Array:
 
 
 FindInvisible = Callable[[Array], Flags]
-"""Which objects (N,) are no longer visible under weather codes (4,)."""
+"""Which objects (N,) are no longer visible under weather codes (5,)."""
 
 _DUSK = math.log10(15_000 / 3.4)
 """Decades of illuminance (lx) from daylight (10,000 to 20,000 without direct sun) to the end of civil twilight,
-until which one sees without lamps: vehicles here have none lit. Illuminances, here and below, are from the RCA
-Electro-Optics Handbook (1974) and Schlyter's Radiometry and photometry in astronomy."""
+until which one sees without lamps; beyond it, lamps replace daylight (the code of night). Illuminances, here and
+below, are from the RCA Electro-Optics Handbook (1974) and Schlyter's Radiometry and photometry in astronomy."""
 _COVER = math.log10(400 / 40)
 """Decades that a closed cloud cover absorbs. Fog is a cloud cover on the ground."""
 _STORM = math.log10(2_000 / 200)
@@ -434,15 +434,17 @@ CODE_SUMS = np.array(
     [
         # Drops of rain wash those of fog out of the air, the faster the stronger it rains; fog in rain forms where
         # weak rain evaporates into cold air (AMS Glossary of Meteorology: washout, precipitation fog).
-        [1.0, 1.0, 0.0, 0.0],
-        [0.0, 1.0, 0.0, -1.0],
-        [_COVER / _DUSK, _STORM / _DUSK, 1.0, _COVER / _DUSK],
+        [1.0, 1.0, 0.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0, -1.0, 0.0],
+        [_COVER / _DUSK, _STORM / _DUSK, 1.0, _COVER / _DUSK, 0.0],
+        # The glow of dusk ends as night falls.
+        [0.0, 0.0, 1.0, 0.0, 1.0],
     ]
 )
-"""Sums (3, 4) of the codes of fog, rain, time of day and overcast."""
-CODE_SUM_LIMITS = np.array([1.0, _BRIGHT_RAIN, 1.0])
-"""Upper limits (3,) of CODE_SUMS."""
-RULE_NAMES = ("fog in rain", "rain without cover", "dark")
+"""Sums (4, 5) of the codes of `Weather`."""
+CODE_SUM_LIMITS = np.array([1.0, _BRIGHT_RAIN, 1.0, 1.0])
+"""Upper limits (4,) of CODE_SUMS."""
+RULE_NAMES = ("fog in rain", "rain without cover", "dark", "dusk at night")
 _HALVINGS = 5
 """Bisection steps of the visibility limit, to 1/32 of a change."""
 
@@ -463,6 +465,7 @@ class WeatherSet:
         """
         self._where, self._find_invisible = where, find_invisible
         self._start = to_float64_array(space.scene.environment.weather)
+        self._sums = CODE_SUMS[:, : where.stop - where.start]
         self._lower, self._upper = to_float64_array(space.lower)[where], to_float64_array(space.upper)[where]
         # Sums that the photographed scene already exceeds may only not grow.
         self._room = (
@@ -507,20 +510,21 @@ class WeatherSet:
         return active + invisible
 
     def _exceeded(self, change: Array) -> Flags:
-        """(3,), which of CODE_SUMS exceed their limits."""
-        return CODE_SUMS @ change > self._room + TOLERANCE
+        """(4,), which of CODE_SUMS exceed their limits."""
+        return self._sums @ change > self._room + TOLERANCE
 
     def _invisible(self, change: Array) -> list[str]:
         if self._find_invisible is None or not change.any():
             return []
-        return [f"objects[{i}]: contrast" for i in np.flatnonzero(self._find_invisible(self._start + change))]
+        codes = self._start + np.pad(change, (0, len(self._start) - len(change)))
+        return [f"objects[{i}]: contrast" for i in np.flatnonzero(self._find_invisible(codes))]
 
     def _find_nearest(self, codes: Array) -> Array:
-        """The point (4,) of the set nearest to codes (4,), exactly: the distance to a polyhedron by non-negative
+        """The point of the set nearest to codes (4,) or (5,), exactly: the distance to a polyhedron by non-negative
         least squares (Lawson and Hanson 1974, chapter 23).
         """
         axes = np.eye(len(codes))
-        rows = np.concatenate([-CODE_SUMS, axes, -axes])
+        rows = np.concatenate([-self._sums, axes, -axes])
         offsets = np.concatenate([-self._room, self._lower, -self._upper]) - rows @ codes
         system, target = np.vstack([rows.T, offsets]), np.append(np.zeros(len(codes)), 1.0)
         residual = system @ nnls(system, target)[0] - target

@@ -36,7 +36,7 @@ from drivesem.synth.write import Order, list_jobs, plan_job
 from scene_ir import ffd, files
 from scene_ir.derender.derender import VEHICLE_CATEGORIES
 from scene_ir.errors import FormatError
-from scene_ir.types import LATTICE, SceneIR
+from scene_ir.types import DAYLIGHT_DIM, LATTICE, SceneIR, Weather
 
 MANIFEST = "manifest.json"
 _GENERATED_RUN = "a run on generated frames: the embedded scenes, or drivesem synth --layout kitti"
@@ -186,10 +186,14 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
             mesh=tuple(ffd.to_symmetric(bend).tolist()) if bool(bend.any()) else (),
             size=grown,
         )
+    if not torch.equal(after.lamps, before.lamps):
+        missing.append("lamps: generated vehicles are drawn without")
     environment, then = changed.environment, still.environment
+    if bool(environment.weather[Weather.NIGHT] != then.weather[Weather.NIGHT]):
+        missing.append("night: generated streets are drawn by daylight")
     edit = FrameEdit(
         objects=edits,
-        weather=tuple((environment.weather - then.weather).detach().clamp(0, 1).tolist()),
+        weather=(*(environment.weather - then.weather).detach().clamp(0, 1).tolist()[:DAYLIGHT_DIM], 0.0),
         foliage=tuple((environment.foliage - then.foliage).detach().clamp(-1, 1).tolist()),
         sun=tuple((environment.light - then.light).detach().clamp(-1, 1).tolist()),
     )

@@ -32,7 +32,7 @@ from scene_ir.render.kernels.colour import (
     rgb_to_lab_adjoint,
     scale_odds,
 )
-from scene_ir.types import Environment
+from scene_ir.types import DAYLIGHT_DIM, Environment
 
 start_warp()
 wp.set_module_options(SIMD_OPTIONS)
@@ -890,7 +890,8 @@ def apply_weather(
         image, inverse, environment, air: As there.
         streaks: (H, W) in [0, 1].
     """
-    code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
+    code = environment.weather.to(image)[:DAYLIGHT_DIM].contiguous()
+    maps = environment.sky.to(image), environment.road.to(image)
     return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import torch
 
 from drivesem.attacks.feasibility_check import check_places
 from drivesem.attacks.scene_edits import apply_changes, apply_edit
-from drivesem.attacks.space import ParameterSpace, Perturbation
+from drivesem.attacks.space import Budget, ParameterSpace, Perturbation
 from drivesem.config.edits import (
     ALL,
     WEATHER_CODES,
@@ -60,8 +61,10 @@ def test_settings_of_objects(text: str, expected: dict[int | str, ObjectEdit]) -
 
 def test_settings_of_the_scene() -> None:
     assert edit_of("weather.rain=0.4", "foliage.hue=-0.5") == FrameEdit(
-        weather=(0.0, 0.4, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
+        weather=(0.0, 0.4, 0.0, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
     )
+    assert edit_of("weather=fog=0.6,night=1").weather == (0.6, 0.0, 0.0, 0.0, 1.0)
+    assert edit_of("weather.rain=0.4", "weather=fog=0.6").weather == (0.6, 0.0, 0.0, 0.0, 0.0)
     for name, codes in WEATHER_PRESETS.items():
         assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_CODES)
 
@@ -93,6 +96,25 @@ def test_the_sun_is_a_code_of_the_scene(street: Street) -> None:
         edit_of("sun.height=1")
     with pytest.raises(FormatError, match=r"sun.azimuth: expected a code in \[-1, 1\], found 2.0"):
         edit_of("sun.azimuth=2")
+
+
+def test_lamps_by_name_or_code(street: Street) -> None:
+    scene = street()
+    for text, code in (("off", -1.0), ("auto", 0.0), ("brake", 1.0), ("0.5", 0.5)):
+        after = apply_changes(scene, edit_of(f"objects[1].lamps={text}"))
+        assert after.objects.lamps.tolist() == [0.0, code, 0.0, 0.0]
+    assert parse_frame_edit("edit", {"objects": {1: {"lamps": False}}}).objects[1].lamps == -1.0
+    for text in ("blink", "2"):
+        with pytest.raises(FormatError, match=r"lamps?: expected off, auto, brake, or a code|expected off, auto"):
+            edit_of(f"objects[1].lamps={text}")
+
+
+def test_night_on_a_photograph_by_night_has_a_note(street: Street) -> None:
+    scene = street(positions_xz=())
+    edit = edit_of("weather=night")
+    note = "weather.night: the photograph is taken by night, so the code changes little"
+    assert note in apply_edit(replace(scene, photograph=torch.full_like(scene.photograph, 0.1)), edit).notes
+    assert note not in apply_edit(replace(scene, photograph=torch.full_like(scene.photograph, 0.5)), edit).notes
 
 
 def test_later_settings_of_the_same_parameter_win() -> None:
@@ -132,13 +154,23 @@ def test_bare_numbers_of_a_file_are_in_units_of_theta() -> None:
         ("objects[2].translate=1m", "object 2: translate: expected a list of 2"),
         ("objects[2].translate=1m,inf m", "expected a finite number, found 'inf '"),
         ("objects[2].rotate=fastdeg", "expected a finite number, found 'fast'"),
-        ("objects[2].wheels=4", "object 2: wheels: expected one of translate, rotate, color, mesh, size, remove"),
+        (
+            "objects[2].wheels=4",
+            "object 2: wheels: expected one of translate, rotate, color, mesh, size, lamps, remove",
+        ),
         ("objects[2].color=3,0,0,0,0", "expected 5 codes in"),
         ("objects[2].color=0,0", "color: expected a list of 5"),
         ("objects[2].remove=yes", "remove: expected true or false, found 'yes'"),
         ("objects[-1].rotate=1deg", "objects: expected a number from 0, or all, found '-1'"),
         ("objects[two].rotate=1deg", "objects: expected a number from 0, or all, found 'two'"),
-        ("weather=snow", "weather: expected codes, or one of fog, rain, sunset, overcast, twilight, found 'snow'"),
+        (
+            "weather=snow",
+            "weather: expected codes such as fog=0.6,night=1, or one of fog, rain, sunset, overcast, twilight, night, "
+            "found 'snow'",
+        ),
+        ("weather=snow=1", "weather: snow: expected one of fog, rain, time, overcast, night"),
+        ("weather=night=2", r"weather.night: expected a code in \[0, 1\], found 2.0"),
+        ("weather=fog=0.5,night", "weather: expected codes such as"),
         ("weather.snow=1", "weather: snow: expected one of fog, rain, time, overcast"),
         ("weather.fog=2", r"weather.fog: expected a code in \[0, 1\], found 2.0"),
         ("foliage=autumn", "an unknown parameter"),
@@ -197,9 +229,10 @@ def test_it_moves_as_theta_does(street: Street) -> None:
 
     change = Perturbation(
         color=rows(count, 5), translate=rows(count, 2), rotate=rows(count, 1), mesh=rows(count, SYMMETRIC_DIM),
-        weather=rows(4).abs(), foliage=rows(3),
+        weather=rows(5).abs(), foliage=rows(3),
     )  # fmt: skip
-    space = ParameterSpace(scene, ["color", "weather", "foliage", "translate", "rotate", "mesh"])
+    params = ["color", "weather", "foliage", "translate", "rotate", "mesh"]
+    space = ParameterSpace(scene, params, Budget(night=1.0))
     expected = space.apply(scene, space.flatten(change))
     assert change.translate is not None
     assert change.rotate is not None
@@ -230,7 +263,7 @@ def test_all_and_one_add_up_and_codes_end_at_their_bounds(street: Street) -> Non
     turned = torch.rad2deg(after.objects.yaw - scene.objects.yaw)
     torch.testing.assert_close(turned, torch.tensor([1.0, 1.0, 3.0, 1.0]), atol=1e-4, rtol=0)
     foggy = apply_changes(apply_changes(scene, edit_of("weather.fog=0.8")), edit_of("weather.fog=0.8"))
-    assert foggy.environment.weather.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert foggy.environment.weather.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_no_change_keeps_every_bit(street: Street) -> None:
@@ -238,7 +271,7 @@ def test_no_change_keeps_every_bit(street: Street) -> None:
     after = apply_changes(scene, edit_of("objects[all].rotate=0deg"))
     assert torch.equal(after.objects.translation, scene.objects.translation)
     assert torch.equal(after.objects.yaw, scene.objects.yaw)
-    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0))).environment.weather[0] == 1
+    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0, 0))).environment.weather[0] == 1
 
 
 def test_removal_names_rows(street: Street) -> None:

@@ -76,6 +76,7 @@ def test_a_car_hides_sky_and_road_from_weather(photographed: SceneIR, name: str)
         # The same airlight, whatever counts as sky.
         compositor = Compositor(scene, REFERENCE)
         compositor.air = photographed.photograph.new_tensor([0.7, 0.75, 0.8])
+        compositor.lamps = Compositor(photographed, REFERENCE).lamps
         return compositor.render(replace(scene, environment=changed))
 
     without, everywhere = drawn(0.0), drawn(1.0)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from scene_ir.render import environment as env
 from scene_ir.render import model
-from scene_ir.types import Environment, SceneIR
+from scene_ir.types import WEATHER_DIM, Environment, SceneIR
 
 H, W = 40, 64
 FOG, RAIN, TIME, OVERCAST = range(4)
@@ -169,5 +169,5 @@ def test_sky_colour_is_photographed_or_default() -> None:
 
 
 def test_shadows_soften_in_bad_weather_only() -> None:
-    assert float(env.shadow_softening(torch.zeros(4))) == 1.0
-    assert float(env.shadow_softening(torch.tensor([0.0, 0.0, 0.0, 1.0]))) < 0.6
+    assert float(env.shadow_softening(torch.zeros(WEATHER_DIM))) == 1.0
+    assert float(env.shadow_softening(torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0]))) < 0.6

@@ -11,7 +11,7 @@ from torch import Tensor
 from scene_ir.ffd import from_symmetric
 from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import Crop, SceneIR, convert_scene
+from scene_ir.types import WEATHER_DIM, Crop, SceneIR, convert_scene
 
 PARAMETERS = ("translation", "yaw", "ffd", "size", "texture_code", "weather", "foliage", "light")
 VALUE, GRADIENT = 2e-4, 1e-4
@@ -41,7 +41,7 @@ def draws(scene: SceneIR, seed: int, spread: float, active: tuple[str, ...]) -> 
     count = len(scene.objects)
     shapes = {
         "translation": (count, 3), "yaw": (count,), "ffd": (count, 96), "texture_code": (count, 5), "weather":
-        (4,), "foliage": (3,), "light": (3,), "size": (count,),
+        (WEATHER_DIM,), "foliage": (3,), "light": (3,), "size": (count,),
     }  # fmt: skip
     scales = {
         "translation": 0.5, "yaw": 0.3, "ffd": 0.03, "size": 0.1, "texture_code": 0.4, "weather": 0.4,

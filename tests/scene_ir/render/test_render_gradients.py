@@ -54,6 +54,11 @@ def _in_weather(scene: SceneIR, theta: Tensor) -> SceneIR:
     return _translate(scene.with_environment(weather=theta.new_tensor([0.2, 0.6, 0.1, 0.8])), theta)
 
 
+def _by_night(scene: SceneIR, theta: Tensor) -> SceneIR:
+    """Moved with lamps on, in their glare on a wet road."""
+    return _translate(scene.with_environment(weather=theta.new_tensor([0.2, 0.5, 0.0, 0.5, 0.7])), theta)
+
+
 PARAMETERS = {
     "texture": Parameter(3 * TEXTURE_DIM, _texture, 1e-4, 0.4),
     "weather": Parameter(WEATHER_DIM, lambda s, t: s.with_environment(weather=t), 1e-4, 0.5, True),
@@ -61,6 +66,7 @@ PARAMETERS = {
     "sun": Parameter(LIGHT_DIM, lambda s, t: s.with_environment(light=t), 1e-4, 0.9),
     "translate": Parameter(6, _translate, 1e-4, 0.3),
     "translate in weather": Parameter(6, _in_weather, 1e-4, 0.3),
+    "translate by night": Parameter(6, _by_night, 1e-4, 0.3),
     "rotate": Parameter(3, lambda s, t: s.with_objects(yaw=s.objects.yaw + t), 1e-4, 0.12),
     "mesh": Parameter(15, _ffd, 1e-4, 0.01),
     "size": Parameter(3, lambda s, t: s.with_objects(size_lhw=s.objects.size_lhw * (1 + t)[:, None]), 1e-4, 0.1),

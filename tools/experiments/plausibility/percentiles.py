@@ -17,7 +17,7 @@ import numpy as np
 from torch import Tensor
 
 from drivesem.attacks.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, RULE_NAMES
-from drivesem.attacks.space import behind_camera
+from drivesem.attacks.space import SPECS, Parameter, behind_camera
 from drivesem.config.errors import UsageError
 from drivesem.data.kitti import read_labels
 from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
@@ -36,7 +36,7 @@ LOWEST = "lowest"
 """Name of a vehicle's lowest percentile."""
 UNUSUAL = 5.0
 """Percentile below which a value counts as unusual."""
-WEATHER_CODES = ("fog", "rain", "time_of_day", "overcast")
+WEATHER_CODES = tuple(name.partition(".")[2] for name in SPECS[Parameter.WEATHER].names)
 _ANGLE_STEPS = 720
 """Steps of the circle at which densities of angles are compared: half a degree."""
 _SLACK = 1e-5
@@ -166,9 +166,9 @@ class FrameWeather:
 def frame_weather(result: FrameResult) -> FrameWeather | None:
     """The weather of an attacked frame; None if the attack did not change it."""
     values = {c.name: c.value for c in result.theta}
-    codes = [values[f"weather.{name}"] for name in WEATHER_CODES if f"weather.{name}" in values]
-    if len(codes) < len(WEATHER_CODES):
+    if not any(f"weather.{name}" in values for name in WEATHER_CODES):
         return None
+    codes = [values.get(f"weather.{name}", 0.0) for name in WEATHER_CODES]
     shares = CODE_SUMS @ np.array(codes) / CODE_SUM_LIMITS
     worst = int(shares.argmax())
     return FrameWeather(tuple(codes), max(float(shares[worst]), 0.0), RULE_NAMES[worst])

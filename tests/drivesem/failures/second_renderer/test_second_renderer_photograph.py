@@ -14,7 +14,7 @@ from drivesem.failures.second_renderer.opengl import OpenGLContext
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
 from drivesem.synth.demo import demo_scene
 from scene_ir.errors import RangeError
-from scene_ir.types import Crop, Occluder, SceneIR
+from scene_ir.types import WEATHER_DIM, Crop, Occluder, SceneIR
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +113,11 @@ def test_paint_changes_its_vehicle_alone(second: PhotographRenderer, scene: Scen
     assert float(apart.abs().max()) == 0
 
 
-@pytest.mark.parametrize("code", range(4))
+@pytest.mark.parametrize("code", range(WEATHER_DIM))
 def test_weather_changes_the_picture_and_code_zero_does_not(
     code: int, second: PhotographRenderer, scene: SceneIR
 ) -> None:
-    weather = torch.zeros(4)
+    weather = torch.zeros(WEATHER_DIM)
     weather[code] = 0.6
     before = second.render(scene).image
     after = second.render(scene.with_environment(weather=weather)).image

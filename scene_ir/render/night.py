@@ -1,0 +1,221 @@
+"""Night: the photograph under street lamps and the own car's headlamps, as a night camera sees it.
+
+The same surfaces get other light: daylight falls to that of street lamps, the headlamps light what is near and below
+their cut-off, and what shone in the photograph shines on. Light adds up as squares of display values, as for veils
+(`environment.apply_veil`). The share of night s(code) has s(0) = 0, and the picture is x + s change(x): code 0 changes
+no bit, and both sides have a slope.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import kornia
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene_ir.geometry import height_above_ground
+from scene_ir.raster.verbs import Backend
+from scene_ir.render import model
+from scene_ir.render.channels import AIM, CORNER, GLARE, NIGHT_MAPS, NOISE, RISE, STREET
+from scene_ir.types import Environment, SceneIR, Weather
+
+
+@dataclass(frozen=True, slots=True)
+class NightMaps:
+    """What night needs to know of a scene's pixels."""
+
+    maps: Tensor
+    """(11, H, W): rise of a pixel's ray, metres of height per metre of depth; share of the headlamps' beam, with the
+    gain of signs; light of the street lamps relative to that in a pool, for sky its glow relative to the horizon's;
+    share of the pixel that shines; loss of light towards the corners; standard normal noise (3); glare (3), light."""
+    camera_m: float
+    """Height of the camera above the ground."""
+    by_day: float
+    """How far the photograph is taken by day, in [0, 1]; the code changes it so far."""
+
+
+@torch.no_grad()
+def compute_night_maps(scene: SceneIR) -> NightMaps:
+    """Maps of a scene, by its background, depth, sky and camera."""
+    height, width = scene.camera.height, scene.camera.width
+    like = scene.background
+    ground, matrix = (
+        scene.environment.ground.double(),
+        scene.camera.matrix.double().to(scene.environment.ground.device),
+    )
+    up = torch.linalg.inv(matrix[:, :3]).T @ ground[:3]
+    rows, columns = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
+    )
+    rise = up[0] * columns + up[1] * rows + up[2]
+    camera_m = float(ground[3] - up @ matrix[:, 3])
+    tangent = ((columns - matrix[0, 2]) / matrix[0, 0]).numpy()
+    sky, leaves = (getattr(scene.environment, name).double().cpu().numpy() for name in ("sky", "foliage_map"))
+    depth = scene.depth.double().cpu().numpy()
+    rgb = scene.background.permute(1, 2, 0).double().cpu().numpy()
+    aim = model.HEAD_SIDE + (1 - model.HEAD_SIDE) * np.exp(-np.square(tangent / model.HEAD_AIM))
+    aim = aim * (1 + model.RETRO * _signs(rgb, sky, leaves))
+    above_m = height_above_ground(scene.depth, scene.environment.ground, scene.camera.matrix).cpu().numpy()
+    street = _street_light(tangent * np.where(np.isfinite(depth), depth, 0.0), depth, rgb, leaves)
+    road = scene.environment.road.double().cpu().numpy()[..., None]
+    level = float((road * np.square(rgb)).sum() / max(3 * float(road.sum()), 1.0)) or model.ROAD_LIGHT
+    exposure = float(np.clip(model.ROAD_LIGHT / level, *model.EXPOSURE))
+    aim = exposure * aim
+    lit = _lit_share(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
+    horizon = float(matrix[1, 2] / height)
+    glow = np.exp(-np.maximum(horizon - rows.numpy() / height, 0.0) / model.GLOW_HEIGHT)
+    lamps = _street_lamps(scene, depth, camera_m)
+    shining = (lit * np.square(rgb).max(axis=2))[..., None] * np.square(rgb) * model.LIT_GAIN + lamps
+    glare = sum(share * _blur(shining, sigma * height) for sigma, share in model.GLARE)
+    radius = np.square(columns.numpy() / width - 0.5) + np.square(rows.numpy() / height - 0.5)
+    planes = [rise.numpy(), aim, np.where(sky > 0.5, glow, street), lit, 2 * model.CORNER * radius]
+    fixed = torch.from_numpy(np.stack([*planes])).to(like)
+    glare = torch.from_numpy(np.ascontiguousarray(np.moveaxis(glare + lamps, 2, 0))).to(like)
+    return NightMaps(
+        torch.cat([fixed, _noise_field(height, width).to(like), glare]), camera_m, measure_daylight(scene)
+    )
+
+
+def measure_daylight(scene: SceneIR) -> float:
+    """How far a scene's photograph is taken by day, in [0, 1]."""
+    return float(_ramp(np.array(float(scene.photograph.square().mean())), *model.BY_DAY))
+
+
+def apply_night(
+    image: Tensor,
+    inverse_depth: Tensor,
+    environment: Environment,
+    lit: Tensor,
+    lamps: Tensor,
+    night: NightMaps,
+    backend: Backend = "reference",
+) -> Tensor:
+    """The picture (3, H, W) by night, as far as `environment.weather` has it, with lamps on; differentiable to all but
+    the maps.
+
+    Args:
+        image: (3, H, W).
+        inverse_depth: (H, W) 1/m, 0 in the sky.
+        environment: Weather code and map of the sky.
+        lit: (H, W) in [0, 1], share of each pixel that shines: the map, where nothing hides it.
+        lamps: (3, H, W), light of the vehicles' lamps.
+        night: Maps of the scene.
+        backend: Implementation.
+    """
+    code = environment.weather.to(image)
+    share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) * (night.by_day / math.expm1(-model.NIGHTFALL))
+    growth = 1.0 + model.GLARE_FOG * code[Weather.FOG] + model.GLARE_RAIN * code[Weather.RAIN]
+    sky, maps = environment.sky.to(image), night.maps.to(image)
+    if backend == "warp":
+        from scene_ir.render.kernels import night as kernels
+
+        settings = torch.stack([share, growth])
+        return kernels.apply_night(image, inverse_depth, sky, lit, lamps, settings, maps, night.camera_m)
+    depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
+    height = night.camera_m + depth * maps[RISE]
+    below = torch.sigmoid((model.HEAD_CUT_M - height) / model.HEAD_SOFT_M)
+    beam = maps[AIM] * (model.HEAD_ABOVE + (1.0 - model.HEAD_ABOVE) * below)
+    head = beam / (1.0 + (depth / model.HEAD_FAR_M).square())
+    colours = image.new_tensor([model.STREET_RGB, model.HEAD_RGB, (model.LIT_GAIN,) * 3, model.GLOW_RGB])
+    colours = colours[..., None, None]
+    shone = maps[STREET] * colours[0] + lit * colours[2]
+    day = image.square()
+    surface = day / (1.0 + model.SUN_SOFTENED * day)
+    headlit = head * colours[1] * (day + model.RETRO_WHITE * day.pow(3))
+    light = (
+        (surface * shone + headlit) * (1.0 - sky)
+        + sky * maps[STREET] * colours[3]
+        + growth * maps[GLARE:NIGHT_MAPS]
+    )
+    bend = model.NIGHT_BEND**2
+    dark = image + (torch.sqrt(day + share * (light - day) + lamps + bend) - torch.sqrt(day + bend))
+    seen = dark * (1.0 - share * maps[CORNER])
+    return seen + share * maps[NOISE:GLARE] * (model.NOISE + model.NOISE_LEVEL * seen)
+
+
+def _signs(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+    """How far (H, W) a pixel of the background (H, W, 3) is a sign: strong colour, neither sky nor leaves."""
+    chroma = cv2.GaussianBlur(np.ptp(rgb, axis=2), (0, 0), 1.0)
+    return _ramp(chroma, *model.RETRO_CHROMA) * (1 - np.maximum(sky, leaves))
+
+
+def _lit_share(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
+    """How far (H, W) a pixel of the background (H, W, 3) shines: small and brighter than all around, as lamps and
+    windows are; not next to the sky, as its light comes through leaves and wires.
+    """
+    size = max(3, rgb.shape[0] // 24) | 1
+    value = rgb.max(axis=2)
+    around = cv2.morphologyEx(value, cv2.MORPH_OPEN, np.ones((size, size)))
+    near_sky = cv2.dilate((open_to > 0.2).astype(np.float64), np.ones((2 * size + 1,) * 2))
+    small = _ramp(value - around, *model.LIT_CONTRAST)
+    return _ramp(value, *model.LIT_LEVEL) * small * (1 - near_sky)
+
+
+def _street_light(aside_m: np.ndarray, depth_m: np.ndarray, rgb: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+    """Light (H, W) of the street lamps: pools along the road, relative to the middle of one."""
+    total = np.zeros_like(depth_m)
+    for x, z in _street_posts():
+        square = np.square(aside_m - x) + np.square(np.minimum(depth_m, model.HAZE_CAP_M) - z)
+        total += np.power(1 + square / model.STREET_LAMP_M**2, -1.5)
+    # Day's sky shows in the gaps of leaves.
+    gaps = leaves * _ramp(rgb.mean(axis=2), 0.35, 0.65)
+    return (model.STREET_BASE + (1 - model.STREET_BASE) * np.minimum(total, 1.2)) * (1 - 0.9 * gaps)
+
+
+def _street_posts() -> list[tuple[float, float]]:
+    """Places (x, z) m of street lamps."""
+    steps = np.arange(0.6, model.STREET_FAR_M / model.STREET_EVERY_M)
+    return [
+        (float((-1) ** k) * model.STREET_ASIDE_M, float(step) * model.STREET_EVERY_M)
+        for k, step in enumerate(steps)
+    ]
+
+
+def _street_lamps(scene: SceneIR, depth_m: np.ndarray, camera_m: float) -> np.ndarray:
+    """Images (H, W, 3) of the street lamps that nothing hides, as light."""
+    height, width = depth_m.shape
+    out = np.zeros((height, width, 3))
+    ground = scene.environment.ground.double().cpu().numpy()
+    matrix = scene.camera.matrix.double().cpu().numpy()
+    down = -ground[:3]
+    for x, z in _street_posts():
+        # on the ground below, then up
+        foot = np.array([x, (-ground[3] - ground[0] * x - ground[2] * z) / ground[1], z])
+        u, v, w = matrix @ np.append(foot - down * model.STREET_LAMP_M, 1.0)
+        column, row = round(u / w), round(v / w)
+        if not (0 <= column < width and 0 <= row < height) or depth_m[row, column] < z:
+            continue
+        radius = max(model.STREET_LAMP_AT_10_M * 10 / z * height / 720, 0.35)
+        xs, ys = np.arange(width) - u / w, np.arange(height) - v / w
+        spot = np.exp(-0.5 * np.square(ys / radius))[:, None] * np.exp(-0.5 * np.square(xs / radius))
+        out += spot[..., None] * 1.5 * np.array(model.STREET_LAMP_RGB)
+    return out
+
+
+def _blur(light: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Light (H, W, 3), blurred."""
+    return cv2.GaussianBlur(light, (0, 0), max(sigma_px, 0.3), borderType=cv2.BORDER_CONSTANT)
+
+
+def _ramp(values: np.ndarray, low: float, high: float) -> np.ndarray:
+    share = np.clip((values - low) / (high - low), 0, 1)
+    return share * share * (3 - 2 * share)
+
+
+@lru_cache(maxsize=8)
+def _noise_field(height: int, width: int) -> Tensor:
+    """Noise (3, H, W) of a camera, of standard deviation 1, mostly of brightness; constant per frame size."""
+    generator = torch.Generator().manual_seed(19390101)
+    grey, colour = (
+        torch.randn(1, 1, height, width, generator=generator),
+        torch.randn(1, 3, height, width, generator=generator),
+    )
+    grey = kornia.filters.gaussian_blur2d(grey, (5, 5), (0.6, 0.6), border_type="reflect")
+    colour = kornia.filters.gaussian_blur2d(colour, (9, 9), (1.5, 1.5), border_type="reflect")
+    mixed = grey / grey.std().clamp(min=1e-6) + 0.5 * colour / colour.std().clamp(min=1e-6)
+    return (mixed / mixed.std().clamp(min=1e-6))[0]
