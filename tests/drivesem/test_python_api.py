@@ -199,7 +199,7 @@ def test_detections_margins_and_gradients(scene: ds.Scene) -> None:
     ("objective", "error"),
     [
         ("objectness", 0.25),  # the IoU that its targets depend on counts as constant
-        (lambda candidates, *_: -candidates.log_scores[:, 0].mean(), 0.01),  # of all anchors: no score is saturated
+        (lambda candidates, *_: -candidates.log_scores[:, 0].mean(), 0.01),  # of all anchors: none is saturated
     ],
 )
 def test_gradients_are_central_differences(scene: ds.Scene, objective: Any, error: float) -> None:
