@@ -38,6 +38,7 @@ from drivesem.run.attack import (
     WRITTEN,
     AttackWorker,
     load_named_detector,
+    report_fallback,
     summarise_run,
     with_gradient_free_fallback,
     write_run_summary,
@@ -150,9 +151,12 @@ class Counterexample:
             for name, picture in (("before", before), ("after", marked))
         )
         lines = "".join(f"<li>{escape(_describe_failure(failure))}</li>" for failure in result.failures)
-        lines = lines or "<li>nothing fails</li>"
+        lines = lines or (
+            "<li>no failure</li>" if result.attacked else f"<li>{escape(result.reason_not_attacked)}</li>"
+        )
         feasible = "feasible" if self.feasible else f"not feasible: {'; '.join(result.violations)}"
-        grades = ", ".join(f"{count} {grade}" for grade, count in self.grades.items() if count) or "no failure"
+        grades = ", ".join(f"{count} {grade}" for grade, count in self.grades.items() if count)
+        grades = grades or ("no failure" if result.attacked else "not attacked")
         head = f"{self.scene.name}: {grades}; {feasible}, {format_count(result.queries, 'query', 'queries')}"
         return f'<div><p>{escape(head)}</p><div style="display:flex;gap:8px">{figure_html}</div><ul>{lines}</ul></div>'
 
@@ -216,7 +220,8 @@ def attack(
         scene: The scene to attack.
         detector: A name or file as for `drivesem attack --detector`, a loaded detector, a torch module, or a function
             of images (`ds.load_detector`). An object excludes the options `precision` and `tiles`, and any device but
-            its own. A detector without gradient is attacked by climb unless another method is given.
+            its own. A detector without gradient is attacked by climb unless another method is given; a line on standard
+            error names the reason.
         params: Parameters of theta with commas: color, weather, foliage, translate, rotate, mesh, size, sun, lamps.
         combo: Combination of the paper instead of `params`: 1 translate+rotate, 2 translate+rotate+mesh (the
             default), 3 translate+mesh, 4 rotate+mesh.
@@ -273,10 +278,11 @@ def attack(
         if own is not None:
             _check_loaded_detector(own, options)
         loaded = load_named_detector(config) if own is None else own
-        config = with_gradient_free_fallback(config, loaded)
+        usable = with_gradient_free_fallback(config, loaded)
         if callable(objective):
-            config = replace(config, objective=cast("Any", objective))
-        worker = AttackWorker.from_config(config, loaded)
+            usable = replace(usable, objective=cast("Any", objective))
+        worker = AttackWorker.from_config(usable, loaded)
+        report_fallback(config, usable, loaded)
     except UsageError as error:
         raise error.with_arguments() from error
     attacked = worker.attack_scene(source.name, source.ir)

@@ -16,6 +16,7 @@ from typing import Any
 from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector, load_predictor
 from drivesem import __version__
+from drivesem.analysis.transfer import parse_detector_names
 from drivesem.attacks.space import parse_params
 from drivesem.bench import render
 from drivesem.bench.scenes import MAX_CARS
@@ -226,6 +227,14 @@ def _install(config: BenchTool, console: Console) -> BenchResult:
     return BenchResult({**fields, "method": install.METHOD}, sections)
 
 
+def _paths(config: BenchTool, console: Console) -> BenchResult:
+    _on_cpu(config)
+    detectors = parse_detector_names(config.detector, "--detector")
+    rows = [asdict(row) for row in show_progress(install.measure_paths(detectors), len(detectors), console)]
+    table = BenchTable(install.PATHS_TITLE, install.PATHS, rows)
+    return BenchResult({"rows": rows, "method": install.PATHS_METHOD}, [table])
+
+
 def _memory(config: DetectorBenchConfig, console: Console) -> BenchResult:
     if not memory.supported():
         raise UsageError("bench memory", "a system with /proc", sys.platform)
@@ -401,6 +410,7 @@ _MEASURES: dict[str, Callable[[Any, Console], BenchResult]] = {
     "eval": _eval,
     "viewer": _viewer,
     "install": _install,
+    "paths": _paths,
     "memory": _memory,
     "detector": _detector,
     "climb": _climb,

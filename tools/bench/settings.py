@@ -36,7 +36,7 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     weather, foliage: the compositor against the generator; synth: the scene generator; rivals: other renderers
     against the project's; devices: a GPU (--device) against the processor; eval: drivesem eval of many frames
     against pycocotools; viewer: response time of drivesem view to a slider; install: megabytes and seconds from a
-    clone to the first report, and of each start."""
+    clone to the first report, and of each start; paths: minutes from a clone to the report of each --detector."""
     quick: Flag = False
     """Fewer repetitions or frames."""
     cars: Annotated[str, ParsedBy(parse_integers)] = "1,4,8,16"
@@ -54,7 +54,8 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     threads: Count | None = None
     """Threads of torch and of the kernels (default: torch's choice)."""
     detector: str = "squeezedet"
-    """devices, found, moves, redraw, weather, viewer: a shipped detector, a .safetensors file of one, or onnx:FILE."""
+    """devices, found, moves, redraw, weather, viewer: a shipped detector, a .safetensors file of one, or onnx:FILE.
+    paths: detectors of any kind, with commas."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """found, label-free, parts, redraw, depth: demo (generated scenes; needs no data), kitti, vkitti1, vkitti2, coco
     or yolo."""

@@ -249,5 +249,5 @@ def test_nanodet_is_recognised_and_threads_follow_torch() -> None:
     assert predictor.classes.index("Car") == CAR
     assert predictor.graph.session.get_session_options().intra_op_num_threads == torch.get_num_threads()
     raw = predictor.forward(torch.full((1, 3, 375, 1242), 0.5))
-    assert [len(seen) for seen in raw.images] == [4]
+    assert [len(tiles) for tiles in raw.predictions] == [4]
     assert all(bool((d.scores <= 1).all()) for d in predictor.decode(raw))

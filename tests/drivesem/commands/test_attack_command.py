@@ -153,7 +153,7 @@ def test_kitti_folder(kitti_folder: Path, tmp_path: Path) -> None:
     assert "000002" in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_a_frame_in_which_nothing_is_found_before_is_not_attacked(tmp_path: Path) -> None:
+def test_a_frame_without_detections_before_is_not_attacked(tmp_path: Path) -> None:
     words = [*WORDS, "--limit", "1", "--out", tmp_path / "run", "--t-star", "0.9999"]
     metrics = run_json(*words)
     assert metrics["frames_not_attacked"] == {"demo-000": "none of 6 judged vehicles is found before"}
@@ -223,7 +223,7 @@ def test_a_detector_without_gradient_gets_a_method_without(
     ]
     words += ["--nuisances", "off", "--no-confirm", "--t-star", "0.2", "--out", str(tmp_path)]
     assert main(words) == 0
-    captured = "any has no gradient: --method climb takes the place of si-fgsm"
+    captured = "any has no gradient: method climb takes the place of si-fgsm"
     assert capsys.readouterr().err.splitlines()[0] == captured
     assert "method: climb" in (tmp_path / "config.yaml").read_text().splitlines()
     assert main(words) == 0  # and goes on in the same folder

@@ -72,7 +72,7 @@ class Misread(torch.nn.Module):
 """
 
 
-def test_a_network_that_finds_nothing_on_streets_fails(tmp_path: Path) -> None:
+def test_a_network_without_detections_on_streets_fails(tmp_path: Path) -> None:
     path, picture = tmp_path / "mine.py", tmp_path / "streets.png"
     path.write_text(MISREAD)
     words = ("check", "--detector", f"module:{path}:Misread", "--size", "96x64", "--limit", "1")
@@ -86,7 +86,7 @@ def test_a_network_that_finds_nothing_on_streets_fails(tmp_path: Path) -> None:
     assert cv2.imread(str(picture)).shape[1] > 1000
 
 
-def test_eval_warns_of_a_network_that_finds_nothing(small_kitti: Path, tmp_path: Path) -> None:
+def test_eval_warns_of_a_network_without_detections(small_kitti: Path, tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(MISREAD)
     words = ("--dataset", "kitti", "--root", small_kitti, "--workers", "1")

@@ -57,7 +57,7 @@ def test_a_run_shows_its_frames_to_its_detector(small_run: Path) -> None:
     assert viewer_frames.title == "a"
 
 
-def test_a_frame_without_anything_to_attack_did_not_withstand(small_run: Path, tmp_path: Path) -> None:
+def test_a_frame_that_was_not_attacked_did_not_withstand(small_run: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(small_run, run)
     path = run / "frames" / "demo-000" / "result.json"

@@ -111,7 +111,7 @@ def test_a_rule_of_nothing_is_the_whole_neighbourhood() -> None:
     )
 
 
-def test_a_rule_that_separates_nothing_is_not_printed() -> None:
+def test_a_rule_is_not_printed_where_its_intervals_overlap() -> None:
     """Of 10 fresh samples 5 are lost, of 80 outside 38: chance may explain the difference."""
     one = around(20, 40, fresh_fails=5)
     heights = np.linspace(0, 100, 100)
