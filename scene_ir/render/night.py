@@ -61,11 +61,12 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     aim = model.HEAD_SIDE + (1 - model.HEAD_SIDE) * np.exp(-np.square(tangent / model.HEAD_AIM))
     aim = aim * (1 + model.RETRO * _signs(rgb, sky, leaves))
     above_m = height_above_ground(scene.depth, scene.environment.ground, scene.camera.matrix).cpu().numpy()
-    street = _street_light(tangent * np.where(np.isfinite(depth), depth, 0.0), depth, rgb, leaves)
+    street = _street_light(tangent * np.where(np.isfinite(depth), depth, 0.0), depth)
     road = scene.environment.road.double().cpu().numpy()[..., None]
     level = float((road * np.square(rgb)).sum() / max(3 * float(road.sum()), 1.0)) or model.ROAD_LIGHT
     exposure = float(np.clip(model.ROAD_LIGHT / level, *model.EXPOSURE))
-    aim = exposure * aim
+    surface = _surface_share(rgb, sky, leaves)
+    aim, street = exposure * surface * aim, surface * street
     lit = find_lit(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
     horizon = float(matrix[1, 2] / height)
     glow = np.exp(-np.maximum(horizon - rows.numpy() / height, 0.0) / model.GLOW_HEIGHT)
@@ -158,24 +159,30 @@ def find_lit(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
     return _ramp(value, *model.LIT_LEVEL) * small * (1 - near_sky)
 
 
-def _street_light(aside_m: np.ndarray, depth_m: np.ndarray, rgb: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+def _surface_share(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+    """How far (H, W) a pixel shows what lamps can light: day's sky shows in the gaps of leaves, and pale around where
+    its map ends.
+    """
+    reach = max(3, rgb.shape[0] // 5)
+    around = cv2.dilate((sky > 0.5).astype(np.float64), np.ones((reach, reach)))
+    grey = rgb.mean(axis=2)
+    return 1 - 0.9 * np.maximum(leaves * _ramp(grey, 0.35, 0.65), around * _ramp(grey, 0.6, 0.8))
+
+
+def _street_light(aside_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
     """Light (H, W) of the street lamps: pools along the road, relative to the middle of one."""
     total = np.zeros_like(depth_m)
     for x, z in _street_posts():
         square = np.square(aside_m - x) + np.square(np.minimum(depth_m, model.HAZE_CAP_M) - z)
         total += np.power(1 + square / model.STREET_LAMP_M**2, -1.5)
-    # Day's sky shows in the gaps of leaves.
-    gaps = leaves * _ramp(rgb.mean(axis=2), 0.35, 0.65)
-    return (model.STREET_BASE + (1 - model.STREET_BASE) * np.minimum(total, 1.2)) * (1 - 0.9 * gaps)
+    return model.STREET_BASE + (1 - model.STREET_BASE) * np.minimum(total, 1.2)
 
 
 def _street_posts() -> list[tuple[float, float]]:
     """Places (x, z) m of street lamps."""
-    steps = np.arange(0.6, model.STREET_FAR_M / model.STREET_EVERY_M)
-    return [
-        (float((-1) ** k) * model.STREET_ASIDE_M, float(step) * model.STREET_EVERY_M)
-        for k, step in enumerate(steps)
-    ]
+    steps = np.arange(0.6, model.STREET_FAR_M / model.STREET_EVERY_M, 0.5)
+    sides = np.where(np.arange(len(steps)) % 2, -model.STREET_ASIDE_M, model.STREET_ASIDE_M)
+    return list(zip(sides.tolist(), (model.STREET_EVERY_M * steps).tolist(), strict=True))
 
 
 def _street_lamps(scene: SceneIR, depth_m: np.ndarray, camera_m: float) -> np.ndarray:
