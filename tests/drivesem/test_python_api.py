@@ -172,7 +172,10 @@ def test_a_scene_says_what_is_changed(scene: ds.Scene) -> None:
         },
         abs=1e-5,
     )
-    assert changed.weather == pytest.approx({"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4})
+    assert changed.weather == pytest.approx({"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4, "night": 0})
+    by_night = scene.edit("objects[1].lamps=off", weather="fog=0.6,night=1")
+    assert by_night.theta == pytest.approx({"weather.fog": 0.6, "weather.night": 1.0, "objects[1].lamps": -1.0})
+    assert scene.edit(weather="night").render().mean() < 0.5 * scene.render().mean()
     moved = np.abs(changed.boxes() - scene.boxes()).max(axis=1) > 0.01
     assert moved.tolist() == [True, True, False, False, False, False]
 
@@ -324,7 +327,7 @@ def test_edits_are_the_commands(scene: ds.Scene, tmp_path: Path) -> None:
     [
         ((), {}, UsageError, "edit: expected a change"),
         (("objects[1].fly=1",), {}, FormatError, "edit objects\\[1\\].fly=1"),
-        ((), {"weather": "hail"}, FormatError, "edit: weather: expected codes, or one of"),
+        ((), {"weather": "hail"}, FormatError, "edit: weather: expected codes such as fog"),
         ((), {"remove": [99]}, RangeError, "objects\\[99\\]"),
         ((), {"remove": "some"}, UsageError, "remove: expected rows from 0, or 'all'"),
     ],
