@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 import drivesem as ds
 from detectors.base import DetectorError, Predictor, predict
 from detectors.registry import SHIPPED, load_predictor
+from detectors.types import Detections
 from drivesem.attacks.targets import resolve_t_star
 from drivesem.bench.session import BenchTable, Columns
 from drivesem.config.edits import WEATHER_CODES, WEATHER_PRESETS
@@ -490,7 +491,10 @@ def _hits(cache: ResultCache, detector: RecallDetector, picture: Picture, boxes_
     names = [detector.predictor.classes[int(label)].lower() for label in found["labels"]]
     is_vehicle = np.array([name in _DETECTOR_VEHICLES for name in names], bool)
     chosen = is_vehicle & (found["scores"] >= detector.threshold)
-    sights = assign(torch.from_numpy(boxes_xyxy).float(), torch.from_numpy(found["boxes_xyxy"][chosen]))
+    detections = Detections(
+        *(torch.from_numpy(found[name][chosen]) for name in ("boxes_xyxy", "labels", "scores"))
+    )
+    sights = assign(torch.from_numpy(boxes_xyxy).float(), detections)
     return np.array([sight.iou >= _IOU for sight in sights], bool)
 
 

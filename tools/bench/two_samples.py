@@ -48,7 +48,7 @@ def compare_distributions(
     Args:
         real: Values of real frames; their interquartile range is the unit of the distance.
         drawn: Values of drawn frames.
-        draws: Number of bootstrap draws; both sets are drawn anew.
+        draws: Number of bootstrap draws, in which both sets are drawn anew; 0 for no interval.
         generator: Source of random numbers.
     """
     quartiles, others = (np.quantile(values, [0.25, 0.5, 0.75]) for values in (real, drawn))
@@ -60,7 +60,7 @@ def compare_distributions(
             wasserstein_distance(generator.choice(real, len(real)), generator.choice(drawn, len(drawn))) / unit
             for _ in range(draws)
         ]
-        low, high = _interval(np.array(again))
+        low, high = _interval(np.array(again)) if draws else (None, None)
     first, second, third = (float(value) for value in quartiles)
     return DistributionComparison(
         (first, second, third), (float(others[0]), float(others[1]), float(others[2])), distance, low, high

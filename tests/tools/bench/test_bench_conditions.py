@@ -7,7 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from detectors.registry import load_predictor
 from drivesem.config.edits import WEATHER_PRESETS
 from drivesem.evaluation.conditions import ConditionRow
 from drivesem.reporting.drawing import write_picture
@@ -17,8 +19,11 @@ from tools.bench.__main__ import main
 from tools.bench.conditions import (
     DAY,
     UNDRAWN,
+    ConditionFrame,
     ConditionSets,
     DetectedFrame,
+    RecallDetector,
+    detect_frames,
     half_of,
     picture_sheet,
     recall_rows,
@@ -124,6 +129,24 @@ def test_recalls_are_weighted_to_the_heights_of_dry_days() -> None:
     assert (row["real_objects"], row["drawn_objects"]) == (4, 2)
 
 
+def test_detections_of_any_vehicle_class_above_the_threshold_count_once(root: Path) -> None:
+    """One good box, one of a person, one too unsure, and two on the same vehicle."""
+    boxes = torch.tensor(
+        [[0, 0, 49, 39], [100, 0, 149, 39], [200, 0, 249, 39], [2, 0, 49, 39]], dtype=torch.float32
+    )
+
+    def detect(image: torch.Tensor) -> dict[str, torch.Tensor]:
+        scores, labels = torch.tensor([0.9, 0.9, 0.3, 0.8]), torch.tensor([1, 2, 0, 0])
+        return {"boxes": boxes, "scores": scores, "labels": labels}
+
+    predictor = load_predictor(detect, classes=("Car", "bus", "person"))
+    truth = np.array([[0, 0, 49, 39], [100, 0, 149, 39], [200, 0, 249, 39], [3, 2, 52, 41], [0, 0, 9, 20]], float)
+    frame = ConditionFrame("fog", False, "a", truth, lambda: np.zeros((360, 640, 3), np.uint8))
+    (result,) = detect_frames(config(root), [RecallDetector("mine", predictor, 0.5, "")], [frame])
+    assert result.heights.tolist() == [78, 78, 78, 78, 40]
+    assert result.hits.tolist() == [True, False, False, True, False]
+
+
 def test_the_interval_of_a_difference_joins_both_intervals() -> None:
     row = ConditionRow("", 9, 9, 50.0, None, None, None, 0.6, 0.5, 0.7, 1.0)
     other = replace(row, equal_recall=0.4, equal_low=0.3, equal_high=0.5)
@@ -142,6 +165,7 @@ def test_sheets_fill_rows_of_six_and_cut_other_shapes() -> None:
     assert sheet[300, 700, 0] == 0
 
 
+@pytest.mark.slow
 def test_a_run_measures_draws_and_resumes(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
