@@ -77,7 +77,7 @@ def _load_benchmark(name: str) -> Callable[[Any], int]:
 
 
 def _conditions(config: ConditionsConfig, console: Console) -> BenchResult:
-    detectors_of_recall = conditions.load_detectors(config.detectors) if config.recall else []
+    detectors_of_recall = conditions.load_detectors(config.detectors, config.tiles) if config.recall else []
     frames, notes = conditions.collect_frames(config)
     console.print(f"{format_count(len(frames), 'frame')}, real ones of half {config.half}")
     for note in notes:

@@ -431,11 +431,13 @@ class RecallDetector:
     threshold: float
     """Lowest score of a detection."""
     digest: str
-    """SHA-256 of its weights; "" where they are no file."""
+    """SHA-256 of its weights, if they are a file, and its tiling, if that is not the usual one."""
 
 
-def load_detectors(names: str) -> list[RecallDetector]:
+def load_detectors(names: str, tiles: str = "auto") -> list[RecallDetector]:
     """Load detectors of a list such as `squeezedet,onnx-runtime:FILE@0.35`; without @, at their t*.
+
+    `tiles` is the `tiling` of `detectors.registry.load_predictor`.
 
     Raises UsageError for a detector that cannot be loaded or a threshold that is none.
     """
@@ -444,7 +446,7 @@ def load_detectors(names: str) -> list[RecallDetector]:
         name, at, score = text.strip().rpartition("@")
         name = name if at else score
         try:
-            predictor = load_predictor(name)
+            predictor = load_predictor(name, tiling=tiles)
         except DetectorError as error:
             raise UsageError.from_detector_error("--detectors", "detectors", error) from error
         threshold = resolve_t_star(predictor)
@@ -455,6 +457,7 @@ def load_detectors(names: str) -> list[RecallDetector]:
                 raise UsageError("--detectors", "NAME@SCORE with a score between 0 and 1", text.strip())
         weights = SHIPPED.get(name, Path(name.partition(":")[2] or name))
         digest = files.sha256_digest(weights) if weights.is_file() else ""
+        digest += "" if tiles == "auto" else tiles
         loaded.append(RecallDetector(name.rpartition("/")[2], predictor, threshold, digest))
     return loaded
 

@@ -118,7 +118,7 @@ class DetectorBenchConfig(BenchOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConditionsConfig(FrameCommandConfig):
+class ConditionsConfig(TileOption, FrameCommandConfig):
     """Compare drawn weather with real frames in it."""
 
     what: CommandName = ""
