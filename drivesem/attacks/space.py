@@ -547,6 +547,6 @@ def _scene_ground_axes(scene: SceneIR) -> Tensor:
     return ground_axes(objects.yaw, objects.size_lhw[:, 0], scene.environment.ground)
 
 
-def _clamp_code(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:
+def _clamp_code(start: Tensor, change: Tensor, low: float, high: float | Tensor) -> Tensor:
     """start + change within [low, high], or up to `start` where that lies outside, so that 0 changes nothing."""
     return clamp_inclusive(start + change, start.clamp(max=low), start.clamp(min=high))

@@ -59,11 +59,11 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     """
     like = centre
     meshes = [scene.meshes[int(i)] for i in base.mesh_index]
-    unit = torch.stack([_lamp_places(mesh) for mesh in meshes]).to(like)
+    unit = torch.stack([find_lamp_places(mesh) for mesh in meshes]).to(like)
     weights = ffd.lattice_weights(unit.reshape(-1, 3)).reshape(*unit.shape[:2], -1)
-    driven = torch.stack([_is_driven(scene, base, i) for i in range(len(base))]).to(like)
+    driven = torch.stack([is_driven(scene, base, i) for i in range(len(base))]).to(like)
     still = VehicleLamps(unit, weights, torch.zeros_like(unit[..., :2]), driven)
-    xy, depth, facing = _project_lamps(still, scene, base, centre)
+    xy, depth, facing = project_lamps(still, scene, base, centre)
     focal = scene.camera.matrix[0, 0].to(like)
     reach_px = model.LAMP_SEARCH * focal * base.size_lhw[:, 2:].to(like) / depth
     shift_px = torch.zeros_like(xy)
@@ -73,7 +73,7 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     return VehicleLamps(unit, weights, shift_px * (depth / focal)[..., None], driven)
 
 
-def _lamp_places(mesh: Mesh) -> Tensor:
+def find_lamp_places(mesh: Mesh) -> Tensor:
     """Centres (4, 3) of a mesh's lamps in the unit box; usual places where it has none."""
     corners = mesh.vertices[mesh.faces[mesh.part == Part.LIGHT]].double()
     centres = corners.mean(dim=1)
@@ -87,7 +87,7 @@ def _lamp_places(mesh: Mesh) -> Tensor:
     return torch.stack(places)
 
 
-def _is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
+def is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
     """Whether () a vehicle stands where one drives: there is road beyond its side that faces away from the camera's
     path, or the camera's path leads through it. In [0, 1].
     """
@@ -131,7 +131,7 @@ def _snap(foreground: Crop, xy: Tensor, reach_px: float, front: bool) -> Tensor:
     return torch.stack([(columns * weight).sum(), (rows * weight).sum()]) / total - xy
 
 
-def _project_lamps(
+def project_lamps(
     lamps: VehicleLamps, scene: SceneIR, objects: Objects, centre: Tensor, mirrored: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Position (N, 4, 2) px, depth (N, 4) m, and cosine (N, 4) between a lamp's axis and the direction to the camera;
@@ -168,8 +168,8 @@ def draw_lamps(
     """
     height, width = number.shape
     weather = environment.weather.to(centre)
-    xy, depth, facing = _project_lamps(lamps, scene, objects, centre)
-    mirror_xy, *_ = _project_lamps(lamps, scene, objects, centre, mirrored=True)
+    xy, depth, facing = project_lamps(lamps, scene, objects, centre)
+    mirror_xy, *_ = project_lamps(lamps, scene, objects, centre, mirrored=True)
     seen = _visible_share(number, xy.detach(), depth.detach())
     coded = objects.lamps.requires_grad or bool((objects.lamps != 0).any())
     may_shine = (lamps.driven > 0) | coded

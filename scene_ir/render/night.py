@@ -66,7 +66,7 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     level = float((road * np.square(rgb)).sum() / max(3 * float(road.sum()), 1.0)) or model.ROAD_LIGHT
     exposure = float(np.clip(model.ROAD_LIGHT / level, *model.EXPOSURE))
     aim = exposure * aim
-    lit = _lit_share(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
+    lit = find_lit(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
     horizon = float(matrix[1, 2] / height)
     glow = np.exp(-np.maximum(horizon - rows.numpy() / height, 0.0) / model.GLOW_HEIGHT)
     lamps = _street_lamps(scene, depth, camera_m)
@@ -144,12 +144,14 @@ def _signs(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
     return _ramp(chroma, *model.RETRO_CHROMA) * (1 - np.maximum(sky, leaves))
 
 
-def _lit_share(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
+def find_lit(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
     """How far (H, W) a pixel of the background (H, W, 3) shines: small and brighter than all around, as lamps and
     windows are; not next to the sky, as its light comes through leaves and wires.
     """
     size = max(3, rgb.shape[0] // 24) | 1
-    value = rgb.max(axis=2)
+    # Thin bright lines are frames and wires.
+    solid = max(3, rgb.shape[0] // 150)
+    value = cv2.morphologyEx(rgb.max(axis=2), cv2.MORPH_OPEN, np.ones((solid, solid)))
     around = cv2.morphologyEx(value, cv2.MORPH_OPEN, np.ones((size, size)))
     near_sky = cv2.dilate((open_to > 0.2).astype(np.float64), np.ones((2 * size + 1,) * 2))
     small = _ramp(value - around, *model.LIT_CONTRAST)

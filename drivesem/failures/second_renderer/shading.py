@@ -255,7 +255,7 @@ def _draw_lamps(
         facing = float(pose.rotation()[:, 0] @ -place) * np.sign(along) / max(float(np.linalg.norm(place)), 1e-6)
         if place[2] < 1 or facing <= 0:
             continue
-        x, y = (round(float(v)) for v in camera.project(place))
+        x, y = (round(float(v)) for v in camera.project(place.astype(np.float32)))
         if not seen[max(y - 2, 0) : max(y + 3, 0), max(x - 2, 0) : max(x + 3, 0)].any():
             continue
         disc = np.zeros(seen.shape, np.uint8)

@@ -84,9 +84,9 @@ def test_parked_where_no_road_is_beyond_it(photographed: SceneIR) -> None:
     columns = torch.arange(photographed.camera.width)
     road = photographed.environment.road * (columns > 40)
     objects = photographed.objects
-    driven = [bool(lamps._is_driven(photographed, objects, i) > 0.5) for i in range(len(objects))]
-    beside = photographed.with_environment(road=road)
-    parked = [bool(lamps._is_driven(beside, objects, i) > 0.5) for i in range(len(objects))]
+    driven = [bool(lamps.is_driven(photographed, objects, i) > 0.5) for i in range(len(objects))]
+    narrower = photographed.with_environment(road=road)
+    parked = [bool(lamps.is_driven(narrower, objects, i) > 0.5) for i in range(len(objects))]
     assert driven == [True, True, True]
     assert parked == [False, True, True]
 
@@ -110,7 +110,7 @@ def test_a_wet_road_mirrors_them_below(compositor: Compositor) -> None:
 
 def test_on_the_photographs_own_lamp(photographed: SceneIR, compositor: Compositor) -> None:
     still = replace(compositor.lamps, shift_m=torch.zeros_like(compositor.lamps.shift_m))
-    xy, *_ = lamps._project_lamps(still, photographed, photographed.objects, compositor.centre)
+    xy, *_ = lamps.project_lamps(still, photographed, photographed.objects, compositor.centre)
     place = xy[AHEAD, 3].round().long() + torch.tensor([0, 1])
     source = photographed.objects.source[AHEAD]
     values, corner = source.foreground.values.clone(), [source.foreground.x0, source.foreground.y0]
@@ -120,7 +120,7 @@ def test_on_the_photographs_own_lamp(photographed: SceneIR, compositor: Composit
     sources[AHEAD] = replace(source, foreground=replace(source.foreground, values=values))
     painted = replace(photographed.objects, source=tuple(sources))
     found = lamps.find_lamps(photographed, painted, compositor.centre)
-    now, *_ = lamps._project_lamps(found, photographed, painted, compositor.centre)
+    now, *_ = lamps.project_lamps(found, photographed, painted, compositor.centre)
     assert now[AHEAD, 3].tolist() == pytest.approx(place.tolist(), abs=0.5)
     unmoved = found.shift_m[AHEAD, :2]
     assert not unmoved.any()  # its headlamps are not in the photograph
@@ -157,7 +157,7 @@ def test_brake_lamps_by_day_change_their_surroundings_only(photographed: SceneIR
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_templates_know_their_lamps(kind: str) -> None:
-    places = lamps._lamp_places(template(kind))
+    places = lamps.find_lamp_places(template(kind))
     front, rear = places[:2], places[2:]
     assert bool((front[:, 0] > 0.3).all() and (rear[:, 0] < -0.3).all())
     assert bool((places[[0, 2], 2] > 0.15).all() and (places[[1, 3], 2] < -0.15).all())

@@ -40,7 +40,8 @@ def _inputs(height: int, width: int) -> tuple[list[Tensor], night.NightMaps]:
 def _apply(inputs: list[Tensor], code: Tensor, maps: night.NightMaps, backend: str = "reference") -> Tensor:
     image, inverse, sky, lit, lamps = inputs
     blank = torch.zeros_like(sky)
-    environment = Environment(code, *(code.new_zeros(n) for n in (3, 3, 4)), sky, blank, blank)
+    none = code.new_zeros(3)
+    environment = Environment(code, none, none, code.new_zeros(4), sky, blank, blank)
     return night.apply_night(image, inverse, environment, lit, lamps, maps, backend)  # type: ignore[arg-type]
 
 
@@ -135,7 +136,7 @@ def test_small_bright_places_above_the_ground_shine_on_and_patches_of_sun_do_not
     rgb[70:, :40] = 1.0
     sky = torch.zeros(96, 96, dtype=torch.float64).numpy()
     sky[:18] = 1.0
-    lit = night._lit_share(rgb, sky)
+    lit = night.find_lit(rgb, sky)
     assert lit[61, 61] == 1.0
     assert lit[21, 21] == 0.0  # next to the sky
     assert not lit[75:, :35].any()  # too large
