@@ -28,7 +28,7 @@ from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
-from scene_ir.render.environment import move_sun, time_gain
+from scene_ir.render.environment import low_sun_share, move_sun, time_gain
 from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, SUN_STRENGTH
 from scene_ir.render.texture import apply_texture_code
 
@@ -124,12 +124,13 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
     """Light under a weather code: physical counterparts of what the compositor does to the picture."""
     if not any(code):
         return light
-    fog, rain, time, overcast, night = code
+    fog, rain, _, overcast, night = code
     if night:
         raise RangeError("weather.night", "0, since generated streets are drawn by daylight", night)
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
-    daylight = (1 + time_gain(torch.tensor(time, dtype=torch.float64)).numpy()) ** _GAMMA
+    codes = torch.tensor(code, dtype=torch.float64)
+    daylight = (1 + time_gain(codes[2], low_sun_share(codes[0], codes[1], codes[3])).numpy()) ** _GAMMA
 
     def toward(value: np.ndarray, target: np.ndarray | float) -> np.ndarray:
         return (value + cover * (target - value)) * daylight

@@ -37,14 +37,19 @@ def shadow_softening(weather: Tensor) -> Tensor:
     return torch.exp(-(weather.new_tensor(model.SHADOW_SOFTENING) * weather).sum())
 
 
-def time_gain(time: Tensor) -> Tensor:
+def low_sun_share(fog: Tensor, rain: Tensor, overcast: Tensor) -> Tensor:
+    """Share () of a low sun's warm light that reaches the street: under clouds and in fog, dusk is grey to blue."""
+    return (1.0 - fog) * (1.0 - rain) * (1.0 - overcast)
+
+
+def time_gain(time: Tensor, low_sun: Tensor) -> Tensor:
     """Relative change (3,) of RGB by the time of day, a code () in [0, 1]: warm light at one half, then blue
-    twilight.
+    twilight. low_sun: () of `low_sun_share`.
     """
     square = time * time
     darkening, warmth = time.new_tensor(model.DARKENING), time.new_tensor(model.WARMTH)
     dusk, dim = torch.exp(-model.DUSK_ENDS * square), torch.exp(-model.DIMMING_ENDS * square)
-    return torch.expm1(-darkening * square) + (warmth * time * dusk - model.DIMMING * time * dim)
+    return torch.expm1(-darkening * square) + (low_sun * warmth * time * dusk - model.DIMMING * time * dim)
 
 
 @torch.no_grad()
@@ -154,7 +159,7 @@ def apply_weather(
     air = air + model.OVERCAST * overcast * (model.OVERCAST_AIR * grey_air - air)
     air = air + model.HAZE_GREY * (fog + rain - fog * rain) * ((air * luma).sum() - air)
 
-    gain = time_gain(time)
+    gain = time_gain(time, low_sun_share(fog, rain, overcast))
     image = image + gain[:, None, None] * image
     air = air + gain * air
 

@@ -118,6 +118,48 @@ class DetectorBenchConfig(BenchOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ConditionsConfig(TileOption, FrameCommandConfig):
+    """Compare drawn weather with real frames in it."""
+
+    what: CommandName = ""
+    """Benchmark. conditions: light, colour, sharpness, noise and lamps of drawn and real frames by condition, a probe
+    that separates them, sheets of both, and detectors' recalls."""
+    dataset: Annotated[str, OneOf(("bdd100k", "coco"))] = "coco"
+    """Layout of --root: bdd100k or coco, with the attributes weather and timeofday."""
+    root: str | None = None
+    """Folder of BDD100K's frames."""
+    fog_root: str | None = None
+    """Folder of real frames in fog (DAWN) in COCO's layout."""
+    half: Annotated[str, OneOf(("A", "B", "all"))] = "B"
+    """Half of the real frames, by a hash of their names: A (constants may be chosen on it), B (for reports), or all."""
+    frames: Count = 24
+    """Drawn frames of each condition."""
+    real: Count = 48
+    """Most real frames of each condition, in the order of the hash."""
+    full: Flag = False
+    """Draw each weather with its own code at 1, and no other code, instead of its preset."""
+    redraw: Flag = False
+    """Draw the pictures in --out again, after a change of the renderer. To de-render again, delete --out/scenes."""
+    recall: Flag = False
+    """Measure detectors' recalls too."""
+    detectors: str = "squeezedet,yolov3-slim"
+    """Detectors of --recall, with commas; NAME@SCORE sets a threshold other than t*."""
+    bootstrap: Annotated[Count, at_least(10)] = 400
+    """Bootstrap draws."""
+    threads: Count | None = None
+    """Threads of torch (default: torch's choice)."""
+    markdown: str | None = None
+    """Markdown file in which this benchmark's section is replaced."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.root is None, "--root", "the folder of BDD100K's frames", "nothing")
+        refuse(self.out is None, "--out", "a folder for scenes, pictures and sheets", "nothing")
+        refuse(self.out is not None and self.out.endswith(".json"), "--out", "a folder", self.out)
+        refuse(self.device != "cpu", "--device", "cpu", self.device)
+
+
+@dataclass(frozen=True, kw_only=True)
 class GradcheckConfig(SceneOptions, FrameCommandConfig):
     """Compare gradients with central differences; exit code 1 on a mismatch. One scene without --limit."""
 

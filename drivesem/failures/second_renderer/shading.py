@@ -155,6 +155,8 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
     fog, rain, time, overcast, _ = environment.weather.tolist()
     if not (fog or rain or time or overcast):
         return image
+    # Drops scatter all colours equally.
+    mist = np.exp(-1.6 * (fog + rain))
     sky, road = (open_to[..., None] * to_numpy(m)[..., None] for m in (environment.sky, environment.road))
     light, air = image**_GAMMA, air**_GAMMA
     if overcast:
@@ -166,7 +168,7 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
         light += 0.9 * overcast * (plain - light)
         air = air + 0.9 * overcast * (0.8 * float(air @ _LUMA) - air)
     if time:
-        gain = np.exp(-_DUSK * time**2 + _GLOW * np.sin(np.pi * time))
+        gain = np.exp(-_DUSK * time**2 + mist * (1 - overcast) * _GLOW * np.sin(np.pi * time))
         light, air = light * gain, air * gain
     depth = np.minimum(depth_m, _LAYER_M)[..., None]
     if rain:
@@ -176,8 +178,6 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
         wet += road * np.clip(0.1 + depth / 90, 0, 0.5) * (mirror - wet)
         light = light + rain * (wet - light)
     light = np.clip(light, 0, 1)
-    # Drops scatter all colours equally.
-    mist = np.exp(-1.6 * (fog + rain))
     air = mist * air + (1 - mist) * float(air @ _LUMA)
     if rain:
         light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.65 * air - light)

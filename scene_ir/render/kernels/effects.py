@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 from scene_ir.raster.launch import Floats, launch, split_range, start_warp, threads
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, store, store3, sum3
 from scene_ir.render import model
+from scene_ir.render.environment import low_sun_share
 from scene_ir.render.kernels.colour import (
     clamp01,
     clamp01_adjoint,
@@ -56,14 +57,16 @@ WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
 
 _STRIP = 64
 """Columns that a CPU thread smears at a time; `_mirror_columns` and its adjoint have room for this many."""
-(OVERCAST, WET, MIST, COVER, GAIN, GAIN_SLOPE, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_HAZE, SETTINGS) = (
-    *(0, 1, 2, 3, 4),
-    *(7, 10, 13, 16, 19, 22),
-)
+(OVERCAST, WET, MIST, COVER) = range(4)
+(GAIN, GAIN_SLOPE, GAIN_BY_SUN, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_SUN, AIR_BY_HAZE) = range(4, 28, 3)
+SETTINGS = 28
 """First index of each setting, equal for all pixels, and their count: weight of overcast; rain; fog; overcast of a
-black sky; gain of the time of day (3) and its slope (3); airlight (3), its slopes along overcast (3) and time (3),
-and its change by either of fog and rain, fully on alone (3).
+black sky; gain of the time of day (3), its slopes along time (3) and the low sun's share (3); airlight (3), its
+slopes along overcast, time and the low sun's share (3 each), and its change by either of fog and rain, fully on alone
+(3).
 """
+CODES = 5
+"""Codes of the kernels: fog, rain, time, overcast, the low sun's share."""
 
 
 @wp.func
@@ -83,12 +86,13 @@ def _settings_kernel(start: int, code: Floats, air: Floats, settings: Floats):
     dark = wp.exp(-DARKENING[c] * square)
     one = wp.float64(1.0)
     two = wp.float64(2.0)
-    warmth = WARMTH[c] * time
+    low_sun = wp.float64(code[4])
+    warmth = WARMTH[c] * time * dusk
     dimming = wp.float64(model.DIMMING)
-    gain = (dark - one) + warmth * dusk - dimming * time * dim
+    gain = (dark - one) + low_sun * warmth - dimming * time * dim
     slope = (
         -two * DARKENING[c] * time * dark
-        + WARMTH[c] * (one - two * wp.float64(model.DUSK_ENDS) * square) * dusk
+        + low_sun * WARMTH[c] * (one - two * wp.float64(model.DUSK_ENDS) * square) * dusk
         - dimming * (one - two * wp.float64(model.DIMMING_ENDS) * square) * dim
     )
     _luma = _grey_air(air)
@@ -107,10 +111,12 @@ def _settings_kernel(start: int, code: Floats, air: Floats, settings: Floats):
         settings[COVER] = wp.float32(wp.float64(COVER_AIR) * _luma + wp.float64(model.COVER_LIGHT))
     settings[GAIN + c] = wp.float32(gain)
     settings[GAIN_SLOPE + c] = wp.float32(slope)
+    settings[GAIN_BY_SUN + c] = wp.float32(warmth)
     settings[AIR + c] = wp.float32(misty + gain * misty)
     along = away + greyed * (darker - away)
     settings[AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * along * (one + gain))
     settings[AIR_BY_TIME + c] = wp.float32(slope * misty)
+    settings[AIR_BY_SUN + c] = wp.float32(warmth * misty)
     settings[AIR_BY_HAZE + c] = wp.float32(wp.float64(model.HAZE_GREY) * paler * (one + gain))
 
 
@@ -255,7 +261,7 @@ def _wet_kernel(
 
 @wp.func
 def _dampen_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: Floats):
-    """Gradients of `_dampen` to x, to rain, time and overcast (3), and to sky."""
+    """Gradients of `_dampen` to x; to rain, time, overcast and the low sun's share (4); and to sky."""
     overcast = load(settings, OVERCAST)
     damping = model.DAMP * load(settings, WET)
     gain = load3(settings, GAIN, 1)
@@ -263,13 +269,15 @@ def _dampen_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: Floats)
     covered = x + overcast * change
     rain = model.DAMP * wp.dot(g, _damp_change(_apply_gain(covered, gain)))
     wetted = g + damping * ((DAMP * g + DAMP_GREY * sum3(g) * LUMA) - g)
-    time = wp.dot(wp.cw_mul(wetted, covered), load3(settings, GAIN_SLOPE, 1))
+    by_gain = wp.cw_mul(wetted, covered)
+    time = wp.dot(by_gain, load3(settings, GAIN_SLOPE, 1))
+    low_sun = wp.dot(by_gain, load3(settings, GAIN_BY_SUN, 1))
     timed = _apply_gain(wetted, gain)
     flat = (1.0 - sky) * timed
     grey_slope = FLAT_GREY * sum3(flat) + model.COVER_STRUCTURE * sky * sum3(timed)
     out = timed + overcast * ((FLAT * flat + grey_slope * LUMA) - timed)
     g_sky = overcast * wp.dot(timed, _overcast_change(x, 1.0, settings) - _overcast_change(x, 0.0, settings))
-    return out, wp.vec3f(rain, time, model.OVERCAST * wp.dot(timed, change)), g_sky
+    return out, wp.vec4f(rain, time, model.OVERCAST * wp.dot(timed, change), low_sun), g_sky
 
 
 @wp.func
@@ -282,7 +290,7 @@ def _haze_adjoint(
     g: wp.vec3f,
     settings: Floats,
 ):
-    """Gradients of `_apply_sheen` and `_apply_haze` to x, mirrored, (fog, rain, time, overcast), inverse, road."""
+    """Gradients of `_apply_sheen` and `_apply_haze` to x, mirrored, fog, the other codes (4), inverse, road."""
     rain = load(settings, WET)
     fog = load(settings, MIST)
     air = load3(settings, AIR, 1)
@@ -312,17 +320,25 @@ def _haze_adjoint(
         + (model.SHEEN_AIR * wet) * g_wet
     )
     g_grey = wp.dot(g_air, load3(settings, AIR_BY_HAZE, 1))
-    code = wp.vec4f(
-        g_fogged * depth + (1.0 - rain) * g_grey,
+    to_fog = g_fogged * depth + (1.0 - rain) * g_grey
+    codes = wp.vec4f(
         g_hazed * depth + model.STREAKS * streak * g_streak + seen * g_sheen + (1.0 - fog) * g_grey,
         wp.dot(g_air, load3(settings, AIR_BY_TIME, 1)),
         wp.dot(g_air, load3(settings, AIR_BY_OVERCAST, 1)),
+        wp.dot(g_air, load3(settings, AIR_BY_SUN, 1)),
     )
     bend = (model.SHEEN_FAR * 6.0 / SHEEN_OVER) * (t - t * t)
     g_depth = g_fogged * fog + g_hazed * rain + g_sheen * rain * road * bend
     g_inverse = wp.where(inverse >= NEAREST, -(depth * depth) * g_depth, 0.0)
     g_road = g_sheen * rain * _grazing_sheen(depth)
-    return (1.0 - wet) * g_wet, (model.SHEEN_MIRROR * wet) * g_wet, code, g_inverse, g_road
+    return (1.0 - wet) * g_wet, (model.SHEEN_MIRROR * wet) * g_wet, to_fog, codes, g_inverse, g_road
+
+
+@wp.func
+def _store4(planes: Floats, i: int, plane: int, values: wp.vec4f):
+    """Store four values at pixel i of as many planes."""
+    store3(planes, i, plane, wp.vec3f(values[0], values[1], values[2]))
+    store(planes, i + 3 * plane, values[3])
 
 
 @wp.kernel
@@ -340,21 +356,21 @@ def _dry_adjoint_kernel(
     code_parts: Floats,
     grad_maps: Floats,
 ):
-    """shares: each pixel's part of the gradients to fog, rain, time, overcast, one plane each; grad_maps: to sky
-    and road, likewise.
+    """code_parts: each pixel's part of the gradients to the `CODES`, one plane each; grad_maps: to sky and road,
+    likewise.
     """
     i = start + wp.tid()
     colour = load3(image, i, plane)
     sky_share = load(sky, i)
     x = _dampen(colour, sky_share, settings)
-    g, _mirrored, code, g_inverse, _road = _haze_adjoint(
+    g, _mirrored, to_fog, codes, g_inverse, _road = _haze_adjoint(
         x, x, 0.0, load(inverse, i), load(streaks, i), load3(grad, i, plane), settings
     )
     g_colour, parts, g_sky = _dampen_adjoint(colour, sky_share, g, settings)
     store3(grad_image, i, plane, g_colour)
     store(grad_inverse, i, g_inverse)
-    store(code_parts, i, code[0])
-    store3(code_parts, i + plane, plane, wp.vec3f(code[1], code[2], code[3]) + parts)
+    store(code_parts, i, to_fog)
+    _store4(code_parts, i + plane, plane, codes + parts)
     store(grad_maps, i, g_sky)
     store(grad_maps, i + plane, 0.0)
 
@@ -382,7 +398,7 @@ def _wet_adjoint_kernel(
     """Back to the mirror: grad_image receives the gradient to the picture before it."""
     i = start + wp.tid()
     x = _dampen(load3(image, i, plane), load(sky, i), settings)
-    g, g_mirrored, code, g_inverse, g_road = _haze_adjoint(
+    g, g_mirrored, to_fog, codes, g_inverse, g_road = _haze_adjoint(
         x,
         load3(mirrored, i - first, wet_pixels),
         load(road, i),
@@ -394,8 +410,8 @@ def _wet_adjoint_kernel(
     store3(grad_mirrored, i - first, wet_pixels, g_mirrored)
     store3(grad_image, i, plane, g)
     store(grad_inverse, i, g_inverse)
-    store(code_parts, i, code[0])
-    store3(code_parts, i + plane, plane, wp.vec3f(code[1], code[2], code[3]))
+    store(code_parts, i, to_fog)
+    _store4(code_parts, i + plane, plane, codes)
     store(grad_maps, i + plane, g_road)
 
 
@@ -418,7 +434,11 @@ def _damp_adjoint_kernel(
     g = load3(grad_image, i, plane) + load3(grad_damp, i - first, wet_pixels)
     g_colour, parts, g_sky = _dampen_adjoint(load3(image, i, plane), load(sky, i), g, settings)
     store3(grad_image, i, plane, g_colour)
-    store3(code_parts, i + plane, plane, load3(code_parts, i + plane, plane) + parts)
+    first_parts = load3(code_parts, i + plane, plane)
+    last_part = load(code_parts, i + 4 * plane)
+    _store4(
+        code_parts, i + plane, plane, wp.vec4f(first_parts[0], first_parts[1], first_parts[2], last_part) + parts
+    )
     store(grad_maps, i, g_sky)
 
 
@@ -569,7 +589,7 @@ _scratch = _ScratchMemory()
 
 
 class _Weather(torch.autograd.Function):
-    """Weather over image (3, H, W) at inverse depth (H, W); code (4,), air (3,); sky, road, streaks (H, W)."""
+    """Weather over image (3, H, W) at inverse depth (H, W); code (5,), air (3,); sky, road, streaks (H, W)."""
 
     @staticmethod
     def forward(
@@ -616,7 +636,7 @@ class _Weather(torch.autograd.Function):
         plane, first, last = height * width, wet.top * width, wet.bottom * width
         grad_image, grad_inverse = torch.empty_like(image), torch.empty_like(inverse)
         grad_maps = image.new_empty(2, height, width)
-        scratch = _scratch.planes(image, 4 * plane, 3 * (last - first), 3 * (last - first))
+        scratch = _scratch.planes(image, CODES * plane, 3 * (last - first), 3 * (last - first))
         parts, to_mirror, to_damp = (flat_array(t) for t in scratch)
         inputs = [settings_in, image_in, inverse_in, sky_in, streaks_in, plane, flat_array(grad)]
         outputs = [flat_array(grad_image), flat_array(grad_inverse), parts, flat_array(grad_maps)]
@@ -627,7 +647,7 @@ class _Weather(torch.autograd.Function):
         _launch_mirror(wet, width, to_mirror, to_damp, False)
         inputs = [settings_in, image_in, sky_in, plane, to_damp, first, last - first]
         launch(_damp_adjoint_kernel, _ranges(first, last), [*inputs, outputs[0], *outputs[2:]])
-        grad_code = _sum_rows_first(scratch[0].view(4, height, width))
+        grad_code = _sum_rows_first(scratch[0].view(CODES, height, width))
         return grad_image, grad_inverse, grad_code, None, *grad_maps, None
 
 
@@ -890,8 +910,9 @@ def apply_weather(
         image, inverse, environment, air: As there.
         streaks: (H, W) in [0, 1].
     """
-    code = environment.weather.to(image)[:DAYLIGHT_DIM].contiguous()
-    maps = environment.sky.to(image), environment.road.to(image)
+    code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
+    fog, rain, time, overcast = code[:DAYLIGHT_DIM]
+    code = torch.stack([fog, rain, time, overcast, low_sun_share(fog, rain, overcast)])
     return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
 
 

@@ -100,6 +100,14 @@ def test_twilight_is_dark_and_blue_sunset_is_warm() -> None:
     assert float(warm[0] / warm[2]) > 1.1 * float(mean[0] / mean[2])
 
 
+@pytest.mark.parametrize("index", [FOG, RAIN, OVERCAST])
+def test_a_low_sun_is_warm_in_clear_air_only(index: int) -> None:
+    warm, hidden = (_weather(_code(TIME, 0.4) + share * _code(index, 1.0))[1] for share in (0.0, 1.0))
+    warmth = [float((x[0] - x[2]).mean()) for x in (_weather(_code(index, 1.0))[1], warm, hidden)]
+    assert warmth[1] > 0.02
+    assert warmth[2] <= warmth[0] + 0.005
+
+
 def test_overcast_and_rain_reduce_colour_and_contrast() -> None:
     for index in (RAIN, OVERCAST):
         image, after = _weather(_code(index, 1.0))
