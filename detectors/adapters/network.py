@@ -344,7 +344,10 @@ _LOADED: set[str] = set()
 def describe_user_error(error: Exception) -> str | None:
     """An error of a user class with its location, if the error came through the class's file; otherwise None."""
     frames = traceback.extract_tb(error.__traceback__)
-    return describe_error(error) if any(frame.filename in _LOADED for frame in frames) else None
+    files = {frame.filename for frame in frames}
+    if isinstance(error, SyntaxError):  # a file that was never run has no frame
+        files.add(str(error.filename))
+    return describe_error(error) if files & _LOADED else None
 
 
 def load_user_detector(spec_name: str, spec: Path | None = None) -> Detector:
@@ -469,6 +472,7 @@ def _import_file(path: Path) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    _LOADED.add(str(path))
     # Dataclasses and pickle look up a class's module by name.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

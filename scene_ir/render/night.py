@@ -45,8 +45,8 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     height, width = scene.camera.height, scene.camera.width
     like = scene.background
     ground, matrix = (
-        scene.environment.ground.double(),
-        scene.camera.matrix.double().to(scene.environment.ground.device),
+        scene.environment.ground.double().cpu(),
+        scene.camera.matrix.double().cpu(),
     )
     up = torch.linalg.inv(matrix[:, :3]).T @ ground[:3]
     rows, columns = torch.meshgrid(
