@@ -5,7 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import supervision
 import torch
+from supervision.metrics import MeanAveragePrecision
 
 from detectors.adapters.supervision import from_supervision, to_supervision
 from detectors.base import DetectorError, predict
@@ -19,7 +21,6 @@ FOUND = Detections(
 
 
 def test_detections_go_out_and_come_back() -> None:
-    supervision = pytest.importorskip("supervision")
     out = to_supervision(FOUND, CLASSES)
     assert isinstance(out, supervision.Detections)
     assert out["class_name"].tolist() == ["bus", "Car"]
@@ -29,7 +30,6 @@ def test_detections_go_out_and_come_back() -> None:
 
 
 def test_no_detections_go_out_and_come_back() -> None:
-    supervision = pytest.importorskip("supervision")
     none = Detections(torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0))
     assert len(to_supervision(none, CLASSES)) == 0
     assert len(from_supervision(to_supervision(none, CLASSES))) == 0
@@ -37,17 +37,15 @@ def test_no_detections_go_out_and_come_back() -> None:
 
 
 def test_supervision_draws_and_measures_what_goes_out() -> None:
-    supervision = pytest.importorskip("supervision")
     out = to_supervision(FOUND, CLASSES)
     drawn = supervision.BoxAnnotator().annotate(np.zeros((50, 60, 3), np.uint8), out)
     assert drawn[2:41, 1].any()
     assert not drawn[:, 50:].any()
-    metric = pytest.importorskip("supervision.metrics").MeanAveragePrecision()
+    metric = MeanAveragePrecision()
     assert metric.update(out, out).compute().map50 == pytest.approx(1.0)
 
 
 def test_a_function_may_return_them() -> None:
-    supervision = pytest.importorskip("supervision")
 
     def detect(images: torch.Tensor) -> "supervision.Detections":
         assert images.shape[:2] == (1, 3)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 import drivesem as ds
 from detectors.adapters.maite import MaiteTarget
@@ -64,7 +65,8 @@ def batch_of(data: Any, *rows: int) -> tuple[list[Any], list[Any], list[Any]]:
 
 
 def test_they_have_what_the_protocols_require(data: ds.MaiteDataset, model: ds.MaiteModel) -> None:
-    protocols = pytest.importorskip("maite.protocols.object_detection")
+    from maite.protocols import object_detection as protocols
+
     assert isinstance(data, protocols.FieldwiseDataset)
     assert isinstance(model, protocols.Model)
     assert isinstance(ds.MaiteMetric(), protocols.Metric)
@@ -113,7 +115,8 @@ def test_evaluating_by_maite_equals_the_command(
     detector: Detector,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    evaluate = pytest.importorskip("maite.tasks").evaluate
+    from maite.tasks import evaluate
+
     folder = small_kitti if root is None else root
     if not folder.is_dir():
         pytest.skip(f"{folder} is absent")
@@ -253,8 +256,8 @@ def test_nrtk_perturbs_what_a_detector_is_evaluated_on(
     streets: StreetDataset, model: ds.MaiteModel, detector: Detector
 ) -> None:
     """NRTK's example of brightness."""
-    interop = pytest.importorskip("nrtk.interop")
     from maite.tasks import evaluate
+    from nrtk import interop
     from nrtk.impls.perturb_image.photometric.enhance import BrightnessPerturber
 
     recall = {}
@@ -278,7 +281,7 @@ def test_nrtk_perturbs_what_a_detector_is_evaluated_on(
 
 @pytest.mark.usefixtures("quiet")
 def test_nrtk_perturbs_before_an_attack(streets: StreetDataset, model: ds.MaiteModel) -> None:
-    interop = pytest.importorskip("nrtk.interop")
+    from nrtk import interop
     from nrtk.impls.perturb_image.photometric.enhance import BrightnessPerturber
 
     darker = interop.MAITEObjectDetectionAugmentation(augment=BrightnessPerturber(factor=0.8), augment_id="darker")
@@ -333,6 +336,18 @@ def heart(monkeypatch: pytest.MonkeyPatch, quiet: None) -> Callable[..., Any]:
     return estimators.JaticPyTorchObjectDetector
 
 
+def wrap_for_heart(heart: Callable[..., Any], detector: Detector, image: NDArray[Any]) -> Any:
+    """A detector as HEART's, for images of one size."""
+    return heart(
+        model=TorchvisionModule(detector),
+        input_shape=image.shape,
+        optimizer=None,
+        clip_values=(0, 1),
+        attack_losses=("objectness",),
+        device_type="cpu",
+    )
+
+
 @pytest.mark.usefixtures("quiet")
 def test_heart_attacks_the_pixels_of_a_detector(
     heart: Callable[..., Any], streets: StreetDataset, model: ds.MaiteModel, detector: Detector
@@ -342,14 +357,7 @@ def test_heart_attacks_the_pixels_of_a_detector(
     from heart_library.attacks.attack import JaticAttack
 
     image = (streets.images[0] / 255).astype(np.float32)
-    estimator = heart(
-        model=TorchvisionModule(detector),
-        input_shape=image.shape,
-        optimizer=None,
-        clip_values=(0, 1),
-        attack_losses=("objectness",),
-        device_type="cpu",
-    )
+    estimator = wrap_for_heart(heart, detector, image)
     (by_heart,) = estimator(np.stack([image]))
     (by_drivesem,) = model([image])
     np.testing.assert_array_equal(by_heart.boxes, by_drivesem.boxes)
@@ -373,14 +381,7 @@ def test_a_detector_of_heart_is_a_detector(
     heart: Callable[..., Any], data: ds.MaiteDataset, detector: Detector
 ) -> None:
     image = data.get_input(0)
-    estimator = heart(
-        model=TorchvisionModule(detector),
-        input_shape=image.shape,
-        optimizer=None,
-        clip_values=(0, 1),
-        attack_losses=("objectness",),
-        device_type="cpu",
-    )
+    estimator = wrap_for_heart(heart, detector, image)
     picture = image.transpose(1, 2, 0)
     found = ds.detect(ds.load_detector(estimator, classes=detector.classes), np.ascontiguousarray(picture))
     torch.testing.assert_close(found.scores, ds.detect(detector, np.ascontiguousarray(picture)).scores)

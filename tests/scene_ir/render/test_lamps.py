@@ -68,7 +68,7 @@ def test_red_behind_and_white_in_front(compositor: Compositor) -> None:
     assert shares[ONCOMING] > 0.8
 
 
-def test_nothing_shines_through_what_stands_before_it(compositor: Compositor) -> None:
+def test_lamps_are_hidden_by_nearer_surfaces(compositor: Compositor) -> None:
     scene = compositor.scene
     number = compositor.render(scene).object_id
     environment = replace(scene.environment, weather=_code(night=1.0))

@@ -39,7 +39,7 @@ def test_area_under_the_curve_counts_ties_half() -> None:
     assert roc_area(np.array([0.0, 1.0]), np.array([1.0])) == 0.75
 
 
-def test_separable_sets_are_told_apart() -> None:
+def test_separable_sets_have_a_high_auc() -> None:
     rng = generator()
     first, second = rng.normal(size=(30, 50)), rng.normal(size=(20, 50))
     second[:, 3] += 9
