@@ -189,9 +189,9 @@ def survey_streets(
 
 
 def describe_reading(detector: Predictor) -> str:
-    """How a network's outputs are read, and what else they could be; empty for other detectors."""
+    """How a network's outputs are read, and what else they could be; or what a MAITE model gets; empty for others."""
     decoder = getattr(detector, "decoder", None)
-    return decoder.describe() if isinstance(decoder, OutputDecoder) else ""
+    return decoder.describe() if isinstance(decoder, OutputDecoder) else getattr(detector, "reading", "")
 
 
 def _summarise_streets(found: Sequence[Detections], label: int, t_star: float) -> StreetDetections:

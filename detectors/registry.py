@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -44,11 +44,15 @@ ONNX_RUNTIME = "onnx-runtime"
 """Kind of an ONNX graph without a gradient."""
 HUGGING_FACE = "hf"
 """Kind of a model of transformers: hf:FOLDER or hf:NAME."""
+MODULE = "module"
+"""Kind of a class of the user: module:FILE.py:CLASS."""
+MAITE = "maite"
+"""Kind of a model by MAITE's protocol: maite:FILE.py:NAME."""
 DARKNET = "darknet:"
 """Prefix of Darknet files: darknet:FILE.cfg,FILE.weights; the second may be omitted if it has the same name."""
-KINDS = (ONNX, ONNX_RUNTIME, HUGGING_FACE, "torchvision", "ultralytics", "torchscript", "export", "module")
+KINDS = (ONNX, ONNX_RUNTIME, HUGGING_FACE, "torchvision", "ultralytics", "torchscript", "export", MODULE, MAITE)
 """Prefixes of detectors from elsewhere: KIND:WHAT[,MORE][,SPEC.yaml]."""
-RUNS_CODE = ("ultralytics", "torchscript", "export", "module")
+RUNS_CODE = ("ultralytics", "torchscript", "export", MODULE, MAITE)
 """Kinds that run code from their files when loaded."""
 _SPEC_SUFFIXES = (".yaml", ".yml")
 _MAX_CLASSES = 10_000
@@ -57,7 +61,7 @@ _MAX_ANCHORS = 1000
 
 
 AnyDetector: TypeAlias = "str | Path | Predictor | nn.Module | Callable[[Tensor], Any]"
-"""A name or file, a detector, a torch module with known outputs, or a function of images."""
+"""A name or file, a detector, a torch module with known outputs, a MAITE model, or a function of images."""
 
 
 def find_code_to_run(name_or_path: str | Path) -> str | None:
@@ -81,9 +85,10 @@ def load_predictor(
 
     Args:
         detector: `onnx-runtime:FILE[,SPEC.yaml]`, or anything that `load_detector` accepts; or an object: a detector,
-            which is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); or a
-            function from images (1, 3, H, W), RGB in [0, 1], to `boxes` (M, 4) px, `scores` (M,) and `labels` (M,)
-            in a dict, as torchvision's detectors return them.
+            which is returned as it is; a torch module with outputs of a known format (docs/guide/detector.md); a
+            MAITE model (`detectors.adapters.maite`); or a function from images (1, 3, H, W), RGB in [0, 1], to
+            `boxes` (M, 4) px, `scores` (M,) and `labels` (M,) in a dict, as torchvision's detectors return them, or
+            to `supervision.Detections`.
         device: Device of the weights; ONNX Runtime runs on the CPU. An object stays where it is.
         tiling: Of an ONNX graph, "auto" or "off" (see `detectors.adapters.onnx`).
         classes: Class names that the labels of a function index, or of a torch module without a `spec`.
@@ -147,7 +152,9 @@ def load_detector(
     if name.startswith(DARKNET):
         from detectors.yolov3 import darknet
 
-        network = darknet.load(*(Path(part) for part in rest.split(",", 1)))
+        pairs = (pair for pair in _split_at_commas(rest) if Path(pair[0]).is_file())
+        files = next(pairs, rest.partition(",")[::2])
+        network = darknet.load(*(Path(file) for file in files if file))
     elif name in SHIPPED:
         _check_card(SHIPPED[name])
         network = _load_weights_file(SHIPPED[name])
@@ -176,8 +183,10 @@ def _load_adapted(kind: str, rest: str, device: str | torch.device, tiling: str 
         from detectors.adapters.onnx import OnnxPredictor
 
         return OnnxPredictor(Path(arguments[0]), tiling, spec)
-    from detectors.adapters.network import require_gradient
+    from detectors.adapters.network import load_maite_model, require_gradient
 
+    if kind == MAITE:
+        return load_maite_model(arguments[0], spec)
     return require_gradient(_load_network(kind, arguments, spec).requires_grad_(False).to(device))
 
 
@@ -191,7 +200,7 @@ def _load_network(kind: str, arguments: list[str], spec: Path | None) -> Detecto
         from detectors.adapters.torchvision_models import load_torchvision
 
         return load_torchvision(*arguments, spec=spec)
-    if kind == "module":
+    if kind == MODULE:
         from detectors.adapters.network import load_user_detector
 
         return load_user_detector(arguments[0], spec)
@@ -207,17 +216,25 @@ def _load_network(kind: str, arguments: list[str], spec: Path | None) -> Detecto
 
 def _split_arguments(kind: str, rest: str) -> tuple[list[str], Path | None]:
     """The comma-separated arguments after a prefix, and the YAML file if the last one is one."""
-    commas = [i for i, letter in enumerate(rest) if letter == "," and rest.endswith(_SPEC_SUFFIXES)]
-    for end in (len(rest), *commas):  # a file's name may contain commas
-        file, colon, name = rest[:end].rpartition(":") if kind == "module" else (rest[:end], ":", "file")
-        if kind != "torchvision" and colon and name.isidentifier() and Path(file).is_file():
-            return [rest[:end]], Path(rest[end + 1 :]) if end < len(rest) else None
+    name, comma, weights = rest.partition(",") if kind == "torchvision" else ("", "", rest)
+    for path, more in _split_at_commas(weights):
+        file, _, class_name = path.rpartition(":") if kind in (MODULE, MAITE) else (path, ":", "any")
+        found = class_name.isidentifier() and file and Path(file).exists() and not file.endswith(_SPEC_SUFFIXES)
+        if found and (not more or more.endswith(_SPEC_SUFFIXES)):
+            return [name, path] if comma else [path], Path(more) if more else None
     words = [word.strip() for word in rest.split(",")]
     spec = Path(words.pop()) if len(words) > 1 and words[-1].endswith(_SPEC_SUFFIXES) else None
-    most, more = (2, "[,WEIGHTS]") if kind == "torchvision" else (1, "")
+    most, expected = (2, "[,WEIGHTS]") if kind == "torchvision" else (1, "")
     if not 1 <= len(words) <= most or not all(words):
-        raise DetectorError(f"detector: expected {kind}:WHAT{more}[,SPEC.yaml], found {f'{kind}:{rest}'!r}")
+        raise DetectorError(f"detector: expected {kind}:WHAT{expected}[,SPEC.yaml], found {f'{kind}:{rest}'!r}")
     return words, spec
+
+
+def _split_at_commas(text: str) -> Iterator[tuple[str, str]]:
+    """The text whole, then divided at each comma, the last one first: a file's name may contain commas."""
+    yield text, ""
+    for place in reversed([i for i, letter in enumerate(text) if letter == ","]):
+        yield text[:place], text[place + 1 :]
 
 
 def _load_weights_file(path: Path) -> SqueezeDet | YoloV3:

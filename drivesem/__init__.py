@@ -17,8 +17,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from detectors.adapters.maite import MaiteModel
+    from detectors.adapters.supervision import from_supervision, to_supervision
+    from detectors.adapters.torchvision_interface import TorchvisionModule
     from detectors.registry import load_predictor as load_detector
     from drivesem.analyses import confirm, explain, gate, holes, report, transfer, verify
+    from drivesem.protocols.attack import MaiteAttack
+    from drivesem.protocols.dataset import MaiteDataset
+    from drivesem.protocols.metric import MaiteMetric
     from drivesem.run.counterexample import Counterexample, attack
     from drivesem.run.finished import AttackRun, load_run
     from drivesem.run.probes import Gradient, detect, gradient, margin
@@ -29,13 +35,19 @@ __all__ = [
     "Counterexample",
     "Frames",
     "Gradient",
+    "MaiteAttack",
+    "MaiteDataset",
+    "MaiteMetric",
+    "MaiteModel",
     "Scene",
+    "TorchvisionModule",
     "attack",
     "confirm",
     "demo_scene",
     "derender",
     "detect",
     "explain",
+    "from_supervision",
     "gate",
     "gradient",
     "holes",
@@ -45,14 +57,21 @@ __all__ = [
     "margin",
     "open_dataset",
     "report",
+    "to_supervision",
     "transfer",
     "verify",
 ]
 __version__ = "0.1.0"
 
 _NAMES_BY_MODULE = {
+    "detectors.adapters.maite": ("MaiteModel",),
+    "detectors.adapters.supervision": ("from_supervision", "to_supervision"),
+    "detectors.adapters.torchvision_interface": ("TorchvisionModule",),
     "detectors.registry": ("load_detector",),
     "drivesem.analyses": ("confirm", "explain", "gate", "holes", "report", "transfer", "verify"),
+    "drivesem.protocols.attack": ("MaiteAttack",),
+    "drivesem.protocols.dataset": ("MaiteDataset",),
+    "drivesem.protocols.metric": ("MaiteMetric",),
     "drivesem.run.counterexample": ("Counterexample", "attack"),
     "drivesem.run.finished": ("AttackRun", "load_run"),
     "drivesem.run.probes": ("Gradient", "detect", "gradient", "margin"),

@@ -27,7 +27,7 @@ _EXIT_BAD_INPUT = 2
 _EXIT_INTERRUPTED = 130
 _EXIT_PIPE = 141
 _EXIT_TERMINATED = 143
-RUNS_CODE = re.compile(r"(?:^|[,@])(?:module|torchscript|export|ultralytics):([^,]+)")
+RUNS_CODE = re.compile(r"(?:^|[,@])(?:module|maite|torchscript|export|ultralytics):([^,]+)")
 """Detectors that run code from their files (as `detectors.registry.RUNS_CODE`; a test compares the two)."""
 _CLEANUP_SECONDS = 5.0
 """Seconds that an interrupted command has to clean up before Ctrl-C counts again."""

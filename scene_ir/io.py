@@ -68,6 +68,7 @@ _OBJECT_FIELDS: dict[str, tuple[int, ...]] = {
     "box2d": (4,),
     "truncation": (),
     "occlusion": (),
+    "lamps": (),
 }
 _LABEL_FIELDS: dict[str, tuple[int, ...]] = {
     "boxes_xyxy": (4,),
@@ -188,6 +189,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             **{
                 name: objects_node[name].tensor(count, *shape, integer=name in _INTEGERS)
                 for name, shape in _OBJECT_FIELDS.items()
+                if name != "lamps" or name in objects_node.mapping()  # scenes saved before there were any
             },
             source=sources,
         )

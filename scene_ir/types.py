@@ -273,6 +273,8 @@ class Objects:
     """(N,) int64, 0 to 3, as labelled."""
     source: tuple[Source, ...] = ()
     """One `Source` per object; empty if there is no photograph."""
+    lamps: Tensor = field(default_factory=lambda: torch.zeros(0))
+    """(N,) in [-1, 1]: 0 as the weather makes drivers do it, -1 off, 1 with brake lamps too. Empty is 0 for all."""
 
     def __post_init__(self) -> None:
         n = self.translation.shape[0] if isinstance(self.translation, Tensor) and self.translation.ndim else -1
@@ -286,7 +288,10 @@ class Objects:
         check_shape("objects.box2d", self.box2d, n, 4)
         check_shape("objects.truncation", self.truncation, n)
         check_shape("objects.occlusion", self.occlusion, n, floating=False)
-        for name in ("translation", "yaw", "size_lhw", "ffd", "texture_code"):
+        if isinstance(self.lamps, Tensor) and self.lamps.shape == (0,):
+            object.__setattr__(self, "lamps", self.translation.new_zeros(max(n, 0)))
+        check_shape("objects.lamps", self.lamps, n)
+        for name in ("translation", "yaw", "size_lhw", "ffd", "texture_code", "lamps"):
             check_finite(f"objects.{name}", getattr(self, name))
         if n and float(self.size_lhw.detach().min()) <= 0:
             raise RangeError("objects.size_lhw", "positive metres", float(self.size_lhw.detach().min()))
@@ -438,6 +443,7 @@ class SceneIR:
             size_lhw=torch.stack([s.size_lhw for s in source]),
             ffd=torch.stack([s.ffd for s in source]),
             texture_code=torch.zeros_like(self.objects.texture_code),
+            lamps=torch.zeros_like(self.objects.lamps),
         )
         environment = replace(
             self.environment,

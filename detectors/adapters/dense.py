@@ -9,10 +9,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from detectors import boxes
 from detectors.base import Candidates, Detector, lower_probability
@@ -31,6 +33,23 @@ LEAST_PROBABILITY = 1e-12
 """Lower bound before taking a logarithm."""
 T_STAR = 0.3
 """Default t*, if the score of best F1 has not been measured."""
+
+
+_BATCH_NORMALISATIONS = (F.batch_norm, torch.batch_norm, torch.ops.aten.batch_norm.default)
+
+
+class BatchNormGradientFix(TorchFunctionMode):
+    """Corrects a wrong gradient of torch (2.14 and earlier, on the CPU): batch normalisation of one image misreads a
+    gradient that `flatten` and `permute` behind it have turned to channels last. It reads a contiguous one correctly.
+    """
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        output = func(*args, **(kwargs or {}))
+        if func in _BATCH_NORMALISATIONS and output.requires_grad:
+            output.register_hook(Tensor.contiguous)
+        return output
 
 
 @dataclass(frozen=True, slots=True)

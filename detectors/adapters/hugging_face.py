@@ -11,14 +11,20 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from detectors.adapters.network import NetworkDetector
-from detectors.adapters.spec import MAX_SIDE, NO_CLASS, NetworkSpec, load_spec, with_project_names
+from detectors.adapters.spec import (
+    BACKGROUND_NAMES,
+    MAX_SIDE,
+    NO_CLASS,
+    NetworkSpec,
+    load_spec,
+    with_project_names,
+)
 from detectors.base import DetectorError
 from detectors.files import read_text
 
 _PREPROCESSING = "preprocessor_config.json"
 _MAX_JSON_BYTES = 1 << 20
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-_BACKGROUND_NAMES = ("N/A", "no-object", "__background__")
 
 
 class HuggingFaceDetector(NetworkDetector):
@@ -78,7 +84,7 @@ def load_hugging_face(name: str, spec: Path | None = None) -> HuggingFaceDetecto
     settings, edges = _input_settings(None if file is None else Path(file))
     labels = model.config.id2label
     names = with_project_names(
-        NO_CLASS if labels.get(i) in (None, *_BACKGROUND_NAMES) else str(labels[i]) for i in range(len(labels))
+        NO_CLASS if labels.get(i) in (None, *BACKGROUND_NAMES) else str(labels[i]) for i in range(len(labels))
     )
     named = settings | {"format": "detr", "boxes": "cxcywh", "normalised": True, "classes": names}
     own = {} if spec is None else load_spec(spec)

@@ -7,12 +7,14 @@ suppression return another number of boxes for each image.
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import pkgutil
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -21,8 +23,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from detectors.adapters.dense import LEAST_SCORE, NMS_IOU, T_STAR, DenseDetector, DensePredictions
+from detectors.adapters.dense import (
+    LEAST_SCORE,
+    NMS_IOU,
+    T_STAR,
+    BatchNormGradientFix,
+    DenseDetector,
+    DensePredictions,
+)
 from detectors.adapters.formats import OutputDecoder, flatten_outputs, make_decoder
+from detectors.adapters.function import FunctionPredictor
+from detectors.adapters.maite import adapt_maite_model, is_maite_model
 from detectors.adapters.spec import (
     NetworkSpec,
     fit_images,
@@ -108,7 +119,8 @@ class NetworkDetector(DenseDetector):
         given: Any = normalise_images(network_input, spec)
         if spec.input != "batch":
             given = given[0] if spec.input == "image" else [given[0]]
-        return flatten_outputs(self._call[0](given))
+        with BatchNormGradientFix():
+            return flatten_outputs(self._call[0](given))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or convert the hidden exported module too."""
@@ -152,6 +164,7 @@ def load_torchscript(path: Path, spec: Path | None = None) -> NetworkDetector:
             for kind in (DeprecationWarning, FutureWarning):
                 warnings.simplefilter("ignore", kind)
             network = torch.jit.load(str(path), map_location="cpu", _extra_files=facts).eval()
+            network.to(memory_format=torch.channels_last)  # BatchNormGradientFix cannot reach into it
     except (RuntimeError, ValueError) as error:
         raise DetectorError(f"{path}: expected a TorchScript file, found {_last_line(error)}") from None
     names, size = _parse_ultralytics_facts(facts[_ULTRALYTICS_FACTS])
@@ -212,6 +225,8 @@ def _last_line(error: Exception) -> str:
 
 _ULTRALYTICS_STRIDE = 32
 """Ultralytics models get images padded to a multiple of this, px, without resizing."""
+_RTDETR_SIDE = 640
+"""Input of RT-DETR by default, px: images are stretched to a square."""
 
 
 class _FirstOutput(nn.Module):
@@ -226,9 +241,21 @@ class _FirstOutput(nn.Module):
         return given if isinstance(given, Tensor) else given[0]
 
 
+class _Queries(nn.Module):
+    """RT-DETR reduced to the boxes and logits of all its queries: its first output holds the best scores alone."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        _, (boxes, logits, *_) = self.model(images)
+        return boxes[-1], logits[-1]
+
+
 def load_ultralytics(path: Path, spec: Path | None = None) -> NetworkDetector:
-    """A model file of Ultralytics (YOLOv8, YOLO11, ...; AGPL-3.0) as a detector. The file is a pickle of a whole
-    module, so loading runs the code in it; torch's `weights_only` is not possible.
+    """A model file of Ultralytics (YOLOv8, YOLO11, RT-DETR, ...; AGPL-3.0) as a detector. The file is a pickle of a
+    whole module, so loading runs the code in it; torch's `weights_only` is not possible.
 
     Raises:
         DetectorError: The file is not one, or Ultralytics is missing.
@@ -242,17 +269,24 @@ def load_ultralytics(path: Path, spec: Path | None = None) -> NetworkDetector:
     if path.suffix != ".pt" or not path.is_file():
         raise DetectorError(f"{path}: expected a .pt file of Ultralytics, found none")
     try:
-        model: Any = YOLO(str(path)).model
+        loaded: Any = YOLO(str(path))
+        model = loaded.model
         head = model.model[-1]
         names = with_project_names(str(model.names[i]) for i in range(len(model.names)))
     except Exception as error:  # the reader and the pickle may raise anything
         raise DetectorError(f"{path}: expected a .pt file of Ultralytics, found {error}") from None
-    if not type(head).__name__.endswith("Detect"):
-        raise DetectorError(f"{path}: expected a detector, found one that ends in {type(head).__name__}")
+    own, kind = load_settings(path, spec), type(head).__name__
+    if kind == "RTDETRDecoder":
+        side = int(loaded.overrides.get("imgsz", _RTDETR_SIDE))
+        settings = {"format": "rtdetr", "boxes": "cxcywh", "normalised": True, "activation": "sigmoid"}
+        network = _Queries(model.float().eval())
+        return NetworkDetector(path.stem, network, settings | {"size": (side, side)} | own, names, where=str(path))
+    if not kind.endswith("Detect"):
+        raise DetectorError(f"{path}: expected a detector, found one that ends in {kind}")
     # End-to-end heads give no gradient to boxes they drop.
     if getattr(head, "end2end", False):
         head.end2end = False
-    settings = {"multiple": _ULTRALYTICS_STRIDE, "format": "yolov8"} | load_settings(path, spec)
+    settings = {"multiple": _ULTRALYTICS_STRIDE, "format": "yolov8"} | own
     return NetworkDetector(path.stem, _FirstOutput(model.float().eval()), settings, names, where=str(path))
 
 
@@ -310,7 +344,10 @@ _LOADED: set[str] = set()
 def describe_user_error(error: Exception) -> str | None:
     """An error of a user class with its location, if the error came through the class's file; otherwise None."""
     frames = traceback.extract_tb(error.__traceback__)
-    return describe_error(error) if any(frame.filename in _LOADED for frame in frames) else None
+    files = {frame.filename for frame in frames}
+    if isinstance(error, SyntaxError):  # a file that was never run has no frame
+        files.add(str(error.filename))
+    return describe_error(error) if files & _LOADED else None
 
 
 def load_user_detector(spec_name: str, spec: Path | None = None) -> Detector:
@@ -323,17 +360,44 @@ def load_user_detector(spec_name: str, spec: Path | None = None) -> Detector:
     Raises:
         DetectorError: There is no such class, or it is something else.
     """
-    where, colon, name = spec_name.rpartition(":")
-    if not (colon and where and name.isidentifier()):
-        raise DetectorError(f"module: expected FILE.py:CLASS or PACKAGE.MODULE:CLASS, found {spec_name!r}")
+    found = _find_object("module", spec_name, "CLASS")
+    where, _, name = spec_name.rpartition(":")
+    if not isinstance(found, type):
+        raise DetectorError(f"{where}: expected a class {name}, found {type(found).__name__}")
+    with _named_user_errors(spec_name):
+        return _to_detector(found(), spec_name, name, spec)
+
+
+def load_maite_model(spec_name: str, spec: Path | None = None) -> Predictor:
+    """Load the MAITE model `path/to/file.py:NAME` or `package.module:NAME`; runs its code.
+
+    The name is a model, or a class or function that returns one when it is called without arguments.
+
+    Args:
+        spec_name: File or module, and name.
+        spec: YAML file of settings, which override the model's attribute `spec`.
+
+    Raises:
+        DetectorError: There is no such name, or it is something else.
+    """
+    found = _find_object("maite", spec_name, "NAME")
+    if found is None:
+        raise DetectorError(f"maite: expected a model, class or function {spec_name}, found no such name")
+    with _named_user_errors(spec_name):
+        model = found() if isinstance(found, type) or inspect.isroutine(found) else found
+        return adapt_maite_model(model, {} if spec is None else load_spec(spec), spec_name)
+
+
+@contextmanager
+def _named_user_errors(spec_name: str) -> Iterator[None]:
+    """Raise DetectorError for any error of a user's code."""
     try:
-        return _to_detector(_find_class(where, name)(), spec_name, name, spec)
+        yield
     except DetectorError:
         raise
     except Exception as error:  # user code may raise anything
-        raise DetectorError(
-            f"{spec_name}: expected a class that can be created and run, found {describe_error(error)}"
-        ) from error
+        expected = "code that can be created and run"
+        raise DetectorError(f"{spec_name}: expected {expected}, found {describe_error(error)}") from error
 
 
 def _to_detector(instance: Any, spec_name: str, name: str, spec: Path | None) -> Detector:
@@ -355,84 +419,49 @@ def _adapt_module(module: nn.Module, where: str, name: str, settings: Mapping[st
 
 
 def adapt_object(instance: Any, classes: Sequence[str] | str | None = None) -> Predictor:
-    """A torch module or a function as a detector; see `detectors.registry.load_predictor`.
+    """A torch module, a MAITE model or a function as a detector; see `detectors.registry.load_predictor`.
 
     Args:
         instance: The object.
-        classes: Class names, or "coco" or "coco91"; None uses the module's `spec`.
+        classes: Class names, or "coco" or "coco91"; None uses the module's `spec` or the model's `metadata`.
 
     Raises:
-        DetectorError: It is neither, or its outputs have no known format.
+        DetectorError: It is none of these, or its outputs have no known format.
     """
     settings = {} if classes is None else validate_settings({"classes": classes}, "detector")
+    if is_maite_model(instance):
+        return adapt_maite_model(instance, settings, f"detector {instance.metadata['id']}")
     if isinstance(instance, nn.Module):
         name = type(instance).__name__
         return require_gradient(_adapt_module(instance, f"detector {name}", name, settings).requires_grad_(False))
     if not callable(instance) or isinstance(instance, type):
-        expected = "a name, a file, a detector, a torch.nn.Module or a function of images"
+        expected = "a name, a file, a detector, a torch.nn.Module, a MAITE model or a function of images"
         raise DetectorError(f"detector: expected {expected}, found {type(instance).__name__} {instance!r:.80}")
     if classes is None:
         raise DetectorError(
-            "detector: expected class names for a function (load_detector(..., classes=[...])), found none"
+            "detector: expected class names for a function (load_detector(..., classes=[...])) or in MAITE's "
+            "metadata, found neither"
         )
     return FunctionPredictor(getattr(instance, "__name__", "function"), instance, settings["classes"])
 
 
-class FunctionPredictor:
-    """A detector without a gradient, from a function of images that returns dicts as torchvision's detectors do."""
-
-    def __init__(self, name: str, function: Callable[[Tensor], Any], classes: Sequence[str]) -> None:
-        self.name, self.classes = name, with_project_names(classes)
-        self._function = function
-
-    @torch.no_grad()
-    def forward(self, images: Tensor) -> list[tuple[Mapping[str, Any], tuple[int, int]]]:
-        """The dict of each image, and the image's (height, width)."""
-        outputs = []
-        for image in images:
-            output = self._function(image[None])
-            output = output[0] if isinstance(output, list | tuple) and len(output) == 1 else output
-            if not isinstance(output, Mapping) or not {"boxes", "scores", "labels"} <= output.keys():
-                expected = "a dict with boxes, scores and labels for an image"
-                raise DetectorError(f"detector {self.name}: expected {expected}, found {type(output).__name__}")
-            outputs.append((output, (int(image.shape[1]), int(image.shape[2]))))
-        return outputs
-
-    def decode(self, raw: list[tuple[Mapping[str, Any], tuple[int, int]]]) -> list[Detections]:
-        """Check and clip the boxes, and sort them by score."""
-        return [self._to_detections(output, hw) for output, hw in raw]
-
-    def _to_detections(self, output: Mapping[str, Any], hw: tuple[int, int]) -> Detections:
-        boxes, scores = (torch.as_tensor(output[key]).float().cpu() for key in ("boxes", "scores"))
-        labels = torch.as_tensor(output["labels"]).long().cpu()
-        count = len(scores)
-        whole = bool(((labels >= 0) & (labels < len(self.classes))).all())
-        in_range = bool(((scores >= 0) & (scores <= 1)).all() and boxes.isfinite().all())
-        if boxes.numel() != 4 * count or labels.shape != (count,) or not (whole and in_range):
-            expected = f"boxes (M, 4) px, scores (M,) in [0, 1] and labels (M,) below {len(self.classes)}"
-            found = f"{tuple(boxes.shape)}, {tuple(scores.shape)} and {tuple(labels.shape)}, or other values"
-            raise DetectorError(f"detector {self.name}: expected {expected}, found {found}")
-        boxes = boxes.reshape(-1, 4)
-        limit = boxes.new_tensor([hw[1], hw[0], hw[1], hw[0]])
-        order = scores.argsort(descending=True, stable=True)
-        order = order[torch.tensor([bool(self.classes[i]) for i in labels[order].tolist()], dtype=torch.bool)]
-        return Detections(boxes[order].clamp_min(0).minimum(limit), labels[order], scores[order])
-
-
-def _find_class(where: str, name: str) -> Any:
+def _find_object(kind: str, spec_name: str, what: str) -> Any:
+    """The object FILE.py:NAME or PACKAGE.MODULE:NAME; None if the file has no such name."""
+    where, colon, name = spec_name.rpartition(":")
+    if not (colon and where and name.isidentifier()):
+        raise DetectorError(f"{kind}: expected FILE.py:{what} or PACKAGE.MODULE:{what}, found {spec_name!r}")
     try:
         if where.endswith(".py"):
-            loaded = getattr(_import_file(Path(where)), name, None)
+            found = getattr(_import_file(Path(where)), name, None)
         else:
-            loaded = pkgutil.resolve_name(f"{where}:{name}")
+            found = pkgutil.resolve_name(f"{where}:{name}")
     except ImportError as error:
-        raise DetectorError(f"module: expected a module {where}, found {error}") from None
+        raise DetectorError(f"{kind}: expected a module {where}, found {error}") from None
     except AttributeError:
-        loaded = None
-    if not isinstance(loaded, type):
-        raise DetectorError(f"{where}: expected a class {name}, found {type(loaded).__name__}")
-    _LOADED.add(str(getattr(sys.modules.get(loaded.__module__), "__file__", None)))
-    return loaded
+        found = None
+    home = found if isinstance(found, type) or inspect.isroutine(found) else type(found)
+    _LOADED.add(str(getattr(sys.modules.get(home.__module__), "__file__", None)))
+    return found
 
 
 def _import_file(path: Path) -> Any:
@@ -443,6 +472,7 @@ def _import_file(path: Path) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    _LOADED.add(str(path))
     # Dataclasses and pickle look up a class's module by name.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from detectors import boxes
-from detectors.adapters.dense import DenseDetector, DensePredictions
+from detectors.adapters.dense import BatchNormGradientFix, DenseDetector, DensePredictions
 from detectors.adapters.onnx import INSIDE, OnnxPredictor, is_cut_by_tile
 from detectors.base import Candidates, DetectorError, Predictor
 from detectors.types import Detections
@@ -55,7 +55,8 @@ class OnnxDetector(DenseDetector):
         differentiable = torch.is_grad_enabled() and images.requires_grad
         is_exact = differentiable or images.dtype != torch.float32 or images.device.type != "cpu"
         run = (lambda *given: graph.run_converted(self.network, *given)) if is_exact else graph.run
-        found = [[predictor.predict_tile(image, tile, run) for tile in tiles] for image in images]
+        with BatchNormGradientFix():
+            found = [[predictor.predict_tile(image, tile, run) for tile in tiles] for image in images]
         tile_counts = tuple(tuple(len(scores) for _, scores in of_tiles) for of_tiles in found)
         most = max(sum(counts) for counts in tile_counts)
         # Padded with boxes of no size and no probability, so that images share one tensor.

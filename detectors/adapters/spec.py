@@ -29,6 +29,9 @@ _MAX_YAML_BYTES = 1 << 18
 NO_CLASS = ""
 """Name of a column of scores that is not a class: the background, or a number COCO never assigned."""
 
+BACKGROUND_NAMES = ("N/A", "no-object", "__background__")
+"""Names that lists of classes give to numbers that are not a class."""
+
 COCO_NAMES = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
     "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog", "horse", "sheep", "cow",

@@ -689,7 +689,7 @@ BOUND = 1e-6
 """Tolerance of theta's bounds, in its units: above float32 rounding, below a sign step."""
 SCENE = 1e-5
 """Tolerance between the scene that theta gives and the saved one (m, rad, unit boxes, codes)."""
-_MOVED = ("translation", "yaw", "ffd", "size_lhw", "texture_code")
+_MOVED = ("translation", "yaw", "ffd", "size_lhw", "texture_code", "lamps")
 _CODES = ("weather", "foliage", "light")
 
 

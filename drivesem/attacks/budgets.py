@@ -48,6 +48,7 @@ PRESETS: Mapping[str, Budget] = {
         size=0.1,
         sun=1.0,
         night=1.0,
+        lamps=1.0,
     ),
 }
 _NIGHT = "night"

@@ -112,6 +112,8 @@ class ChangeLimits:
     """Code, absolute."""
     night: float = 0.0
     """Code of night."""
+    lamps: float = 0.0
+    """Code, absolute."""
     roi: bool = False
     """Whether `translate` uses the parametrisation of 3D-SDN."""
 
@@ -344,6 +346,7 @@ def _code_violations(base: SceneIR, perturbed: SceneIR, limits: ChangeLimits) ->
     (old, before), (new, after) = ((scene.objects, scene.environment) for scene in (base, perturbed))
     ranges = {
         "objects.texture_code": (old.texture_code, new.texture_code, -limits.color, limits.color),
+        "objects.lamps": (old.lamps, new.lamps, -limits.lamps, limits.lamps),
         "environment.weather": (before.weather[:_NIGHT], after.weather[:_NIGHT], 0.0, limits.weather),
         "environment.night": (
             before.weather[_NIGHT:],

@@ -17,10 +17,13 @@ from drivesem.config.edits import ALL, FrameEdit, ObjectEdit
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.removal import remove_objects
-from scene_ir.types import SceneIR
+from scene_ir.render.night import measure_daylight
+from scene_ir.types import SceneIR, Weather
 
 REMOVED = "removed"
 """Provenance key of a scene from which vehicles were removed."""
+_DARK = 0.5
+"""Daylight of a photograph below which it counts as taken by night."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +35,7 @@ class EditedScene:
     removed: tuple[int, ...]
     """Rows of the removed vehicles in the scene before."""
     notes: tuple[str, ...]
-    """Violations that `check_places` found, with the limits of the widest budget."""
+    """Violations that `check_places` found, with the limits of the widest budget; night on a photograph by night."""
 
 
 def apply_edit(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> EditedScene:
@@ -51,6 +54,8 @@ def apply_edit(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) -> 
     rows = (row for row in range(len(scene.objects)) if row not in removed)
     photographed = scene.unperturbed() if scene.objects.source else scene  # moves of several edits add up
     notes = check_places(photographed, changed, rows, change_limits(PRESETS[STREET]))
+    if edit.weather[Weather.NIGHT] > 0 and measure_daylight(scene) < _DARK:
+        notes.append("weather.night: the photograph is taken by night, so the code changes little")
     remaining = remove_objects(changed, removed)
     if removed:
         remaining = replace(remaining, provenance={**remaining.provenance, REMOVED: "vehicles, by an edit"})
@@ -91,11 +96,13 @@ def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) 
         bend = summed([[none, *(c.mesh or none for c in row)] for row in changes])
         grown = summed([[(1.0,), *((c.size,) for c in row)] for row in changes])
         paint = summed([[(0.0,) * objects.texture_code.shape[1], *(c.color for c in row)] for row in changes])
+        lamps = summed([[(0.0,), *((c.lamps,) for c in row)] for row in changes])[:, 0]
         changed_fields = {
             "translation": objects.translation + shift.sum(dim=1),
             "yaw": objects.yaw + turn,
             "ffd": objects.ffd + ffd.from_symmetric(bend) + _shape_shares(scene, changes, bent),
             "size_lhw": objects.size_lhw * grown,
+            "lamps": (objects.lamps + lamps).clamp(-1.0, 1.0),
             "texture_code": (objects.texture_code + paint).clamp(-limits.color, limits.color),
         }
     weather = environment.weather + environment.weather.new_tensor(edit.weather)

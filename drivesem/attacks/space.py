@@ -132,9 +132,10 @@ class Parameter(StrEnum):
     MESH = "mesh"
     SIZE = "size"
     SUN = "sun"
+    LAMPS = "lamps"
 
 
-PAPER_PARAMETERS = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN))
+PAPER_PARAMETERS = tuple(p for p in Parameter if p not in (Parameter.SIZE, Parameter.SUN, Parameter.LAMPS))
 """The paper's parameters. The others need a budget beyond the paper's."""
 
 
@@ -162,6 +163,7 @@ SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.SUN: ParameterSpec(
         LIGHT_DIM, False, "code", tuple(f"sun.{n}" for n in ("azimuth", "elevation", "strength"))
     ),
+    Parameter.LAMPS: ParameterSpec(1, True, "code", ("lamps",)),
 }
 
 Parametrisation = Literal["ground", "roi"]
@@ -208,6 +210,8 @@ class Budget:
     """Code, absolute; 0 fixes it."""
     night: float = 0.0
     """Code of night, as far as `weather` allows it too; 0 leaves it out of theta."""
+    lamps: float = 0.0
+    """Code, absolute; 0 fixes it."""
     translate_m: float = math.inf
     """Metres, along and across, the same for long and short vehicles."""
     across_m: float = math.inf
@@ -219,7 +223,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         unbounded = ("translate_m", "across_m", "distance_share", "partly_visible")
-        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun", "night"))
+        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun", "night", "lamps"))
 
     def check(self, params: Iterable[Parameter], parametrisation: Parametrisation = "ground") -> None:
         """Raise FormatError for a parameter that this budget fixes, or for a budget in metres with `roi`."""
@@ -236,7 +240,7 @@ class Budget:
 @dataclass(frozen=True, slots=True)
 class StepSizes:
     """The step alpha of each parameter, in theta's units: the paper's; size steps like translate, sun like
-    foliage.
+    foliage, lamps like weather.
     """
 
     color: float = 0.05
@@ -254,6 +258,8 @@ class StepSizes:
     size: float = 0.01
     """Share of the vehicle's size."""
     sun: float = 0.10
+    """Code."""
+    lamps: float = 0.25
     """Code."""
 
     def __post_init__(self) -> None:
@@ -290,6 +296,8 @@ class Perturbation:
     """(N, 1), share of the own size."""
     sun: Tensor | None = None
     """(3,), codes."""
+    lamps: Tensor | None = None
+    """(N, 1), codes."""
 
     @classmethod
     def between(cls, photographed: SceneIR, scene: SceneIR) -> Perturbation:
@@ -306,6 +314,7 @@ class Perturbation:
             mesh=ffd.to_symmetric(now.ffd - before.ffd),
             size=now.size_lhw[:, :1] / before.size_lhw[:, :1] - 1,
             sun=environment.light.to(before.yaw),
+            lamps=now.lamps[:, None],
         )
 
 
@@ -417,6 +426,8 @@ class ParameterSpace(ThetaSpace[Parameter]):
         budget = self.budget
         if part.color is not None:
             changes["texture_code"] = _clamp_code(objects.texture_code, part.color, -budget.color, budget.color)
+        if part.lamps is not None:
+            changes["lamps"] = _clamp_code(objects.lamps, part.lamps[:, 0], -budget.lamps, budget.lamps)
         if changes:
             scene = scene.with_objects(**changes)
         codes: dict[str, Tensor] = {}
@@ -476,6 +487,8 @@ class ParameterSpace(ThetaSpace[Parameter]):
         limit = getattr(self.budget, parameter.value)
         if parameter is Parameter.COLOR:
             start, low = self.scene.objects.texture_code.reshape(-1), -limit
+        elif parameter is Parameter.LAMPS:
+            start, low = self.scene.objects.lamps, -limit
         elif parameter is Parameter.WEATHER:
             start, low = self.scene.environment.weather[: self.specs[parameter].size], 0.0
             limit = self._weather_limits(start)
@@ -534,6 +547,6 @@ def _scene_ground_axes(scene: SceneIR) -> Tensor:
     return ground_axes(objects.yaw, objects.size_lhw[:, 0], scene.environment.ground)
 
 
-def _clamp_code(start: Tensor, change: Tensor, low: float, high: float) -> Tensor:
+def _clamp_code(start: Tensor, change: Tensor, low: float, high: float | Tensor) -> Tensor:
     """start + change within [low, high], or up to `start` where that lies outside, so that 0 changes nothing."""
     return clamp_inclusive(start + change, start.clamp(max=low), start.clamp(min=high))

@@ -152,6 +152,12 @@ FEATURES = (
         _version_code("ultralytics"),
     ),
     OptionalFeature(
+        "supervision",
+        "detections of supervision in Python (ds.to_supervision)",
+        "pip install 'drivesem[supervision]'",
+        _version_code("supervision"),
+    ),
+    OptionalFeature(
         "ray", "--engine ray: frames shared by a cluster", "pip install 'drivesem[ray]'", _version_code("ray")
     ),
     OptionalFeature(

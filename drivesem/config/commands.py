@@ -105,7 +105,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     combo: Combo | None = None
     """Combination of the paper: 1 translate+rotate, 2 translate+rotate+mesh, 3 translate+mesh, 4 rotate+mesh."""
     params: str | None = None
-    """Parameters instead of a combo, with commas: color, weather, foliage, translate, rotate, mesh, size, sun."""
+    """Parameters, with commas, not a combo: color, weather, foliage, translate, rotate, mesh, size, sun, lamps."""
     method: Literal[SearchMethod, "placebo"] = "si-fgsm"
     """Search method; climb and corners look for failures that hold; placebo makes one random edit (--like)."""
     passes: Annotated[Count, at_least(MIN_PASSES, "which the search needs")] | None = None

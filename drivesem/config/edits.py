@@ -9,6 +9,7 @@ An edit of one frame, as YAML or as nested mappings:
       2: {translate: [0.5m, 0m], rotate: 10deg}
       4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
       3: {size: 5%}                 # larger by so much, on its wheels; -5% is smaller
+      1: {lamps: brake}             # off, auto (as the weather makes drivers do it), brake, or a code in [-1, 1]
       6: {mesh: 60%}                # drivesem edit --photographed: of the shape that the scene's vehicle has
       5: {remove: true}
       all: {rotate: 0.05}
@@ -43,10 +44,12 @@ WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "sunset": {"time": 0.5},
     "overcast": {"overcast": 1.0},
     "twilight": {"time": 1.0},
-    "night": {"night": 1.0, "overcast": 0.5},
+    "night": {"night": 1.0, "overcast": 0.3},
 }
 """Weather codes by name; all others are 0."""
-OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "remove")
+OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "lamps", "remove")
+LAMPS: Mapping[str, float] = {"off": -1.0, "auto": 0.0, "brake": 1.0}
+"""Codes of lamps by name."""
 FRAME_KEYS = ("objects", "weather", "foliage", "sun")
 LENGTH_UNITS = {"m": 1.0}
 ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
@@ -77,12 +80,16 @@ class ObjectEdit:
     """Whether the vehicle and its shadow are removed."""
     mesh_fraction: float = 0.0
     """Fraction, 0 to 1, of the deformation that the scene already has."""
+    lamps: float = 0.0
+    """Code of the lamps, in [-1, 1]."""
 
     def __post_init__(self) -> None:
         if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
             raise RangeError("edit color", f"{TEXTURE_DIM} codes in [-1, 1]", list(self.color))
         if len(self.mesh) not in (0, SYMMETRIC_DIM):
             raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
+        if not -1 <= self.lamps <= 1:
+            raise RangeError("edit lamps", f"{', '.join(LAMPS)}, or a code in [-1, 1]", self.lamps)
         if not abs(self.size) <= MAX_SIZE_CHANGE:
             raise RangeError("edit size", f"a change of at most {MAX_SIZE_CHANGE:.0%} either way", self.size)
         if not 0 <= self.mesh_fraction <= 1:
@@ -229,9 +236,20 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
             size=_fraction(f"{where}: size", entry.get("size", 0)),
             remove=remove,
             mesh_fraction=share,
+            lamps=_lamps(f"{where}: lamps", entry.get("lamps", 0.0)),
         )
     except RangeError as error:
         raise FormatError(where, error.expected, error.actual) from error
+
+
+def _lamps(where: str, value: Any) -> float:
+    # YAML reads off as false
+    if value is False or (isinstance(value, str) and value in LAMPS):
+        return LAMPS["off" if value is False else value]
+    try:
+        return parse_finite_number(where, value)
+    except FormatError as error:
+        raise FormatError(where, f"{', '.join(LAMPS)}, or a code in [-1, 1]", error.actual) from error
 
 
 def require_mapping(where: str, value: Any, known: Sequence[str] | None = None) -> dict[Any, Any]:

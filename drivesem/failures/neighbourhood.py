@@ -231,6 +231,7 @@ def describe_object(objective: Objective, scene: SceneIR, image: SampleImage, in
         Parameter.WEATHER: environment.weather,
         Parameter.FOLIAGE: environment.foliage,
         Parameter.SUN: environment.light,
+        Parameter.LAMPS: objects.lamps[index : index + 1],
     }
     for parameter, values in codes.items():
         if parameter in space.params:

@@ -93,10 +93,7 @@ def attack_dataset(config: AttackConfig) -> RunSummary:
     detector = load_named_detector(config)
     usable_config = with_gradient_free_fallback(config, detector)
     worker = AttackWorker.from_config(usable_config, detector)
-    if usable_config.method != config.method:
-        replacement = f"--method {usable_config.method} takes the place of {config.method}"
-        reason = explain_missing_gradient(detector)
-        sys.stderr.write(f"{config.detector} has no gradient{reason}: {replacement}\n")
+    report_fallback(config, usable_config, detector)
     config = usable_config
     out = Path(config.out) if config.out else Path("runs") / _run_name(config, worker.params)
     claim_folder(out, config, WRITTEN)
@@ -563,6 +560,13 @@ def with_gradient_free_fallback(config: AttackConfig, detector: Predictor) -> At
     fallback = replace(config, method=GRADIENT_FREE_FALLBACK)
     fallback.check()
     return fallback
+
+
+def report_fallback(config: AttackConfig, usable: AttackConfig, detector: Predictor) -> None:
+    """Write a line to standard error if `with_gradient_free_fallback` has replaced the method."""
+    if usable.method != config.method:
+        without = f"{config.detector} has no gradient{explain_missing_gradient(detector)}"
+        sys.stderr.write(f"{without}: method {usable.method} takes the place of {config.method}\n")
 
 
 def _check_detector(config: AttackConfig, detector: Predictor, needs_gradient: bool) -> None:

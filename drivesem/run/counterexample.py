@@ -38,6 +38,7 @@ from drivesem.run.attack import (
     WRITTEN,
     AttackWorker,
     load_named_detector,
+    report_fallback,
     summarise_run,
     with_gradient_free_fallback,
     write_run_summary,
@@ -219,8 +220,9 @@ def attack(
         scene: The scene to attack.
         detector: A name or file as for `drivesem attack --detector`, a loaded detector, a torch module, or a function
             of images (`ds.load_detector`). An object excludes the options `precision` and `tiles`, and any device but
-            its own. A detector without gradient is attacked by climb unless another method is given.
-        params: Parameters of theta with commas: color, weather, foliage, translate, rotate, mesh, size, sun.
+            its own. A detector without gradient is attacked by climb unless another method is given; a line on standard
+            error names the reason.
+        params: Parameters of theta with commas: color, weather, foliage, translate, rotate, mesh, size, sun, lamps.
         combo: Combination of the paper instead of `params`: 1 translate+rotate, 2 translate+rotate+mesh (the
             default), 3 translate+mesh, 4 rotate+mesh.
         budget: Limits of the change: paper, parking, street, or limits such as "translate=0.1".
@@ -276,10 +278,11 @@ def attack(
         if own is not None:
             _check_loaded_detector(own, options)
         loaded = load_named_detector(config) if own is None else own
-        config = with_gradient_free_fallback(config, loaded)
+        usable = with_gradient_free_fallback(config, loaded)
         if callable(objective):
-            config = replace(config, objective=cast("Any", objective))
-        worker = AttackWorker.from_config(config, loaded)
+            usable = replace(usable, objective=cast("Any", objective))
+        worker = AttackWorker.from_config(usable, loaded)
+        report_fallback(config, usable, loaded)
     except UsageError as error:
         raise error.with_arguments() from error
     attacked = worker.attack_scene(source.name, source.ir)

@@ -91,7 +91,7 @@ class Scene:
     def theta(self) -> dict[str, float]:
         """All changes from the photograph, by name, such as objects[3].yaw; empty where nothing is changed."""
         photographed = self.ir.unperturbed()
-        space = ParameterSpace(photographed, tuple(Parameter), Budget(size=1.0, sun=1.0, night=1.0))
+        space = ParameterSpace(photographed, tuple(Parameter), Budget(size=1.0, sun=1.0, night=1.0, lamps=1.0))
         theta = space.flatten(Perturbation.between(photographed, self.ir)).tolist()
         return {space.name(i): value for i, value in enumerate(theta) if abs(value) > _NO_CHANGE}
 

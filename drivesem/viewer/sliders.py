@@ -35,7 +35,7 @@ _STEPS = {"m": 0.01, "deg": 0.1, "%": 0.5, "": 0.01}
 _DIGITS = 6
 """Decimals of values, the precision of float32."""
 _SHAPE = "shape"
-_CODES = (Parameter.COLOR, Parameter.WEATHER, Parameter.FOLIAGE, Parameter.SUN)
+_CODES = (Parameter.COLOR, Parameter.WEATHER, Parameter.FOLIAGE, Parameter.SUN, Parameter.LAMPS)
 _SCENE_CODES = {Parameter.WEATHER: WEATHER_CODES, Parameter.FOLIAGE: FOLIAGE_CODES, Parameter.SUN: SUN_CODES}
 
 

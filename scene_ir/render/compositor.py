@@ -76,7 +76,7 @@ class Compositor(PreparedScene):
         objects = perturbed.objects
         if len(objects) != len(self.scene.objects):
             raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
-        names = ("translation", "yaw", "size_lhw", "ffd", "texture_code")
+        names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "lamps")
         return replace(self.scene.objects, **{name: getattr(objects, name).to(self.like) for name in names})
 
     def compose(self, perturbed: SceneIR, objects: Objects, layers: ObjectLayers | None) -> Render:
@@ -88,7 +88,8 @@ class Compositor(PreparedScene):
             layers: Their layers; None without objects.
         """
         environment, backend = perturbed.environment, self.backend
-        weather, foliage = is_active(environment.weather), is_active(environment.foliage)
+        weather = is_active(environment.weather) or is_active(objects.lamps)
+        foliage = is_active(environment.foliage)
         canvas = self.canvas if weather else self.canvas[:3]
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))

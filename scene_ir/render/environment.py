@@ -176,7 +176,9 @@ def apply_weather(
         streaks = _rain_streaks(*environment.sky.shape).to(image)
         from scene_ir.render.kernels import effects
 
-        return effects.apply_weather(image, inverse_depth, environment, air, streaks)
+        fog, rain, _, overcast = environment.weather.to(image)[:DAYLIGHT_DIM]
+        low_sun = low_sun_share(fog, rain, overcast)
+        return effects.apply_weather(image, inverse_depth, environment, air, low_sun, streaks)
     fog, rain, time, overcast = environment.weather.to(image)[:DAYLIGHT_DIM]
     sky, road = environment.sky.to(image), environment.road.to(image)
     depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)

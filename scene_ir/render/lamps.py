@@ -59,11 +59,11 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     """
     like = centre
     meshes = [scene.meshes[int(i)] for i in base.mesh_index]
-    unit = torch.stack([_lamp_places(mesh) for mesh in meshes]).to(like)
+    unit = torch.stack([find_lamp_places(mesh) for mesh in meshes]).to(like)
     weights = ffd.lattice_weights(unit.reshape(-1, 3)).reshape(*unit.shape[:2], -1)
-    driven = torch.stack([_is_driven(scene, base, i) for i in range(len(base))]).to(like)
+    driven = torch.stack([is_driven(scene, base, i) for i in range(len(base))]).to(like)
     still = VehicleLamps(unit, weights, torch.zeros_like(unit[..., :2]), driven)
-    xy, depth, facing = _project_lamps(still, scene, base, centre)
+    xy, depth, facing = project_lamps(still, scene, base, centre)
     focal = scene.camera.matrix[0, 0].to(like)
     reach_px = model.LAMP_SEARCH * focal * base.size_lhw[:, 2:].to(like) / depth
     shift_px = torch.zeros_like(xy)
@@ -73,7 +73,7 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     return VehicleLamps(unit, weights, shift_px * (depth / focal)[..., None], driven)
 
 
-def _lamp_places(mesh: Mesh) -> Tensor:
+def find_lamp_places(mesh: Mesh) -> Tensor:
     """Centres (4, 3) of a mesh's lamps in the unit box; usual places where it has none."""
     corners = mesh.vertices[mesh.faces[mesh.part == Part.LIGHT]].double()
     centres = corners.mean(dim=1)
@@ -87,7 +87,7 @@ def _lamp_places(mesh: Mesh) -> Tensor:
     return torch.stack(places)
 
 
-def _is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
+def is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
     """Whether () a vehicle stands where one drives: there is road beyond its side that faces away from the camera's
     path, or the camera's path leads through it. In [0, 1].
     """
@@ -131,7 +131,7 @@ def _snap(foreground: Crop, xy: Tensor, reach_px: float, front: bool) -> Tensor:
     return torch.stack([(columns * weight).sum(), (rows * weight).sum()]) / total - xy
 
 
-def _project_lamps(
+def project_lamps(
     lamps: VehicleLamps, scene: SceneIR, objects: Objects, centre: Tensor, mirrored: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Position (N, 4, 2) px, depth (N, 4) m, and cosine (N, 4) between a lamp's axis and the direction to the camera;
@@ -156,7 +156,7 @@ def _project_lamps(
 def draw_lamps(
     lamps: VehicleLamps, scene: SceneIR, objects: Objects, number: Tensor, environment: Environment, centre: Tensor
 ) -> Tensor:
-    """Light (3, H, W) of the vehicles' lamps, as squares of display values; exactly 0 at weather 0.
+    """Light (3, H, W) of the vehicles' lamps, as squares of display values; exactly 0 at weather 0 and `lamps` 0.
 
     Args:
         lamps: Of `find_lamps`.
@@ -168,10 +168,12 @@ def draw_lamps(
     """
     height, width = number.shape
     weather = environment.weather.to(centre)
-    xy, depth, facing = _project_lamps(lamps, scene, objects, centre)
-    mirror_xy, *_ = _project_lamps(lamps, scene, objects, centre, mirrored=True)
+    xy, depth, facing = project_lamps(lamps, scene, objects, centre)
+    mirror_xy, *_ = project_lamps(lamps, scene, objects, centre, mirrored=True)
     seen = _visible_share(number, xy.detach(), depth.detach())
-    index = ((seen > 0) & (facing.detach() > 0) & (lamps.driven[:, None] > 0)).reshape(-1).nonzero()[:, 0]
+    coded = objects.lamps.requires_grad or bool((objects.lamps != 0).any())
+    may_shine = (lamps.driven > 0) | coded
+    index = ((seen > 0) & (facing.detach() > 0) & may_shine[:, None]).reshape(-1).nonzero()[:, 0]
     if not len(index):
         return centre.new_zeros(3, height, width)
     xy, mirror_xy = (places.reshape(-1, 2)[index] for places in (xy, mirror_xy))
@@ -183,9 +185,11 @@ def draw_lamps(
         model.FOG_EXTINCTION_PER_M * weather[Weather.FOG] + model.RAIN_EXTINCTION_PER_M * weather[Weather.RAIN]
     )
     beam = torch.where(front, model.HEADLAMP_WIDE + (1 - model.HEADLAMP_WIDE) * facing.clamp(min=0.0) ** 8, 1.0)
-    strength = (
-        exposure * lamps_on(weather) * seen * lamps.driven[index // 4] * smoothstep(facing, *model.LAMP_FACES)
-    )
+    code = objects.lamps.to(centre)[index // 4]
+    braking = code * torch.sigmoid(model.LAMP_BEND * code)
+    off = -code * torch.sigmoid(-model.LAMP_BEND * code)
+    level = lamps_on(weather) * lamps.driven[index // 4] * (1.0 - off) + model.BRAKE_LAMP * braking * ~front
+    strength = exposure * level.clamp(min=0.0) * seen * smoothstep(facing, *model.LAMP_FACES)
     strength = strength * beam * torch.exp(-extinction * depth)
     colours = centre.new_tensor([model.TAIL_LAMP_RGB, model.HEADLAMP_RGB])[front.long()] * strength[:, None]
     radius = model.LAMP_RADIUS_M * scene.camera.matrix[0, 0].to(depth) / depth
@@ -193,7 +197,8 @@ def draw_lamps(
     core = (radius.square() + model.LAMP_LEAST_PX**2).sqrt()
     area = radius.square()
     growth = 1.0 + model.GLARE_FOG * weather[Weather.FOG] + model.GLARE_RAIN * weather[Weather.RAIN]
-    spots = [(xy, area / core.square(), core, core)]
+    stretch_x, stretch_y = model.LAMP_STRETCH
+    spots = [(xy, area / core.square(), stretch_x * core, stretch_y * core)]
     for k, (sigma, share) in enumerate(model.GLARE):
         # Drops scatter wider than the lens.
         spread = (core.square() + (sigma * height) ** 2).sqrt()
@@ -201,7 +206,10 @@ def draw_lamps(
     across, along = model.STREAK
     streak = model.STREAK_SHARE * area / (across * along * height**2)
     spots.append((xy, streak, torch.full_like(core, across * height), torch.full_like(core, along * height)))
+    # The middle of a tail lamp overflows into white.
+    overflow = model.TAIL_CORE * colours[:, :1] * (~front)[:, None]
     light = _splat(spots, colours, height, width)
+    light = light + _splat(spots[:1], overflow.expand_as(colours), height, width)
     wet = model.DRY_MIRROR + (model.WET_MIRROR - model.DRY_MIRROR) * weather[Weather.RAIN]
     drop = (mirror_xy[:, 1] - xy[:, 1]).clamp(min=1.0)
     mirrored = [(mirror_xy, area / core.square(), 1.5 * core, model.MIRROR_LENGTH * drop + core)]

@@ -226,13 +226,19 @@ HAZE_CAP_M = 300.0
 
 NIGHTFALL = 4.0
 """Rate at which the share of night grows with its code: light falls by about equal factors."""
-STREET_RGB, STREET_BASE = (0.26, 0.19, 0.12), 0.4
+STREET_RGB, STREET_BASE = (0.26, 0.19, 0.12), 0.25
 """Light of street lamps relative to daylight, after the camera's exposure, in the middle of their pools; its share
 between them.
 """
-STREET_LAMP_M, STREET_ASIDE_M, STREET_EVERY_M, STREET_FAR_M = 8.0, 7.0, 32.0, 160.0
-"""Height of street lamps; their distance from the camera's path, alternately left and right; and along it, up to
-the farthest.
+ROAD_LIGHT, EXPOSURE = 0.13, (0.4, 1.2)
+"""Light of a photographed road that the headlamps' light is for; it changes in inverse proportion to it, within bounds,
+as a camera's exposure by night does not depend on that by day.
+"""
+BY_DAY = (0.07, 0.12)
+"""Mean light of a photograph that is taken by night, which the code hardly changes, and of one by day."""
+STREET_LAMP_M, STREET_ASIDE_M, STREET_EVERY_M, STREET_FAR_M = 8.0, 7.0, 36.0, 320.0
+"""Height of street lamps; their distance from the camera's path, alternately left and right; distance along it on
+each side, and of the farthest.
 """
 STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 5.0
 """Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
@@ -240,10 +246,12 @@ GLOW_RGB = (0.0095, 0.0070, 0.0054)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6
 """Share of the picture's height over which that glow falls by a factor e."""
-HEAD_RGB, HEAD_FAR_M = (0.62, 0.52, 0.40), 16.0
+HEAD_RGB, HEAD_FAR_M = (0.60, 0.51, 0.40), 16.0
 """Light of the own headlamps, relative to daylight, on what is near; distance at which it has fallen to half."""
 SUN_SOFTENED = 1.0
-"""Compression of daylight before other light replaces it: sunlit surfaces come closer to those in the shade."""
+"""Compression of daylight before street lamps replace it: sunlit surfaces come closer to those in the shade."""
+RETRO_WHITE = 1.5
+"""Growth of the headlamps' light on the brightest surfaces: road markings and number plates send light back."""
 HEAD_AIM, HEAD_SIDE = 0.32, 0.12
 """Width of the beam, as a tangent, and its share far aside."""
 HEAD_CUT_M, HEAD_SOFT_M, HEAD_ABOVE = 0.9, 0.25, 0.10
@@ -271,8 +279,14 @@ NIGHT_BEND = 0.02
 
 LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0)
 """Rates at which fog, rain, time, overcast and night make drivers switch on their lamps."""
-TAIL_LAMP_RGB, HEADLAMP_RGB = (2.2, 0.10, 0.05), (8.0, 7.2, 6.0)
+TAIL_LAMP_RGB, HEADLAMP_RGB = (2.4, 0.10, 0.06), (8.0, 7.2, 6.0)
 """Light of a lamp that faces the camera by night; white is 1."""
+TAIL_CORE = 0.12
+"""Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
+LAMP_STRETCH = (1.5, 0.7)
+"""Width and height of a lamp, relative to its radius."""
+BRAKE_LAMP, LAMP_BEND = 2.5, 6.0
+"""Light of a brake lamp, relative to a tail lamp's; how sharply lamps code 0 separates off from braking."""
 LAMP_BY_DAY = 0.12
 """The same by daylight, where the exposure is shorter."""
 LAMP_RADIUS_M, LAMP_LEAST_PX = 0.065, 0.6

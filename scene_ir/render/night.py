@@ -35,6 +35,8 @@ class NightMaps:
     share of the pixel that shines; loss of light towards the corners; standard normal noise (3); glare (3), light."""
     camera_m: float
     """Height of the camera above the ground."""
+    by_day: float
+    """How far the photograph is taken by day, in [0, 1]; the code changes it so far."""
 
 
 @torch.no_grad()
@@ -43,8 +45,8 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     height, width = scene.camera.height, scene.camera.width
     like = scene.background
     ground, matrix = (
-        scene.environment.ground.double(),
-        scene.camera.matrix.double().to(scene.environment.ground.device),
+        scene.environment.ground.double().cpu(),
+        scene.camera.matrix.double().cpu(),
     )
     up = torch.linalg.inv(matrix[:, :3]).T @ ground[:3]
     rows, columns = torch.meshgrid(
@@ -59,8 +61,13 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     aim = model.HEAD_SIDE + (1 - model.HEAD_SIDE) * np.exp(-np.square(tangent / model.HEAD_AIM))
     aim = aim * (1 + model.RETRO * _signs(rgb, sky, leaves))
     above_m = height_above_ground(scene.depth, scene.environment.ground, scene.camera.matrix).cpu().numpy()
-    lit = _lit_share(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
-    street = _street_light(tangent * np.where(np.isfinite(depth), depth, 0.0), depth, rgb, leaves)
+    street = _street_light(tangent * np.where(np.isfinite(depth), depth, 0.0), depth)
+    road = scene.environment.road.double().cpu().numpy()[..., None]
+    level = float((road * np.square(rgb)).sum() / max(3 * float(road.sum()), 1.0)) or model.ROAD_LIGHT
+    exposure = float(np.clip(model.ROAD_LIGHT / level, *model.EXPOSURE))
+    surface = _surface_share(rgb, sky, leaves)
+    aim, street = exposure * surface * aim, surface * street
+    lit = find_lit(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
     horizon = float(matrix[1, 2] / height)
     glow = np.exp(-np.maximum(horizon - rows.numpy() / height, 0.0) / model.GLOW_HEIGHT)
     lamps = _street_lamps(scene, depth, camera_m)
@@ -70,7 +77,14 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     planes = [rise.numpy(), aim, np.where(sky > 0.5, glow, street), lit, 2 * model.CORNER * radius]
     fixed = torch.from_numpy(np.stack([*planes])).to(like)
     glare = torch.from_numpy(np.ascontiguousarray(np.moveaxis(glare + lamps, 2, 0))).to(like)
-    return NightMaps(torch.cat([fixed, _noise_field(height, width).to(like), glare]), camera_m)
+    return NightMaps(
+        torch.cat([fixed, _noise_field(height, width).to(like), glare]), camera_m, measure_daylight(scene)
+    )
+
+
+def measure_daylight(scene: SceneIR) -> float:
+    """How far a scene's photograph is taken by day, in [0, 1]."""
+    return float(_ramp(np.array(float(scene.photograph.square().mean())), *model.BY_DAY))
 
 
 def apply_night(
@@ -95,7 +109,7 @@ def apply_night(
         backend: Implementation.
     """
     code = environment.weather.to(image)
-    share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) / math.expm1(-model.NIGHTFALL)
+    share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) * (night.by_day / math.expm1(-model.NIGHTFALL))
     growth = 1.0 + model.GLARE_FOG * code[Weather.FOG] + model.GLARE_RAIN * code[Weather.RAIN]
     sky, maps = environment.sky.to(image), night.maps.to(image)
     if backend == "warp":
@@ -110,10 +124,15 @@ def apply_night(
     head = beam / (1.0 + (depth / model.HEAD_FAR_M).square())
     colours = image.new_tensor([model.STREET_RGB, model.HEAD_RGB, (model.LIT_GAIN,) * 3, model.GLOW_RGB])
     colours = colours[..., None, None]
-    shone = maps[STREET] * colours[0] + head * colours[1] + lit * colours[2]
+    shone = maps[STREET] * colours[0] + lit * colours[2]
     day = image.square()
     surface = day / (1.0 + model.SUN_SOFTENED * day)
-    light = surface * shone * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:NIGHT_MAPS]
+    headlit = head * colours[1] * (day + model.RETRO_WHITE * day.pow(3))
+    light = (
+        (surface * shone + headlit) * (1.0 - sky)
+        + sky * maps[STREET] * colours[3]
+        + growth * maps[GLARE:NIGHT_MAPS]
+    )
     bend = model.NIGHT_BEND**2
     dark = image + (torch.sqrt(day + share * (light - day) + lamps + bend) - torch.sqrt(day + bend))
     seen = dark * (1.0 - share * maps[CORNER])
@@ -126,36 +145,44 @@ def _signs(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
     return _ramp(chroma, *model.RETRO_CHROMA) * (1 - np.maximum(sky, leaves))
 
 
-def _lit_share(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
+def find_lit(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
     """How far (H, W) a pixel of the background (H, W, 3) shines: small and brighter than all around, as lamps and
     windows are; not next to the sky, as its light comes through leaves and wires.
     """
     size = max(3, rgb.shape[0] // 24) | 1
-    value = rgb.max(axis=2)
+    # Thin bright lines are frames and wires.
+    solid = max(3, rgb.shape[0] // 150)
+    value = cv2.morphologyEx(rgb.max(axis=2), cv2.MORPH_OPEN, np.ones((solid, solid)))
     around = cv2.morphologyEx(value, cv2.MORPH_OPEN, np.ones((size, size)))
     near_sky = cv2.dilate((open_to > 0.2).astype(np.float64), np.ones((2 * size + 1,) * 2))
     small = _ramp(value - around, *model.LIT_CONTRAST)
     return _ramp(value, *model.LIT_LEVEL) * small * (1 - near_sky)
 
 
-def _street_light(aside_m: np.ndarray, depth_m: np.ndarray, rgb: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+def _surface_share(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+    """How far (H, W) a pixel shows what lamps can light: day's sky shows in the gaps of leaves, and pale around where
+    its map ends.
+    """
+    reach = max(3, rgb.shape[0] // 5)
+    around = cv2.dilate((sky > 0.5).astype(np.float64), np.ones((reach, reach)))
+    grey = rgb.mean(axis=2)
+    return 1 - 0.9 * np.maximum(leaves * _ramp(grey, 0.35, 0.65), around * _ramp(grey, 0.6, 0.8))
+
+
+def _street_light(aside_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
     """Light (H, W) of the street lamps: pools along the road, relative to the middle of one."""
     total = np.zeros_like(depth_m)
     for x, z in _street_posts():
         square = np.square(aside_m - x) + np.square(np.minimum(depth_m, model.HAZE_CAP_M) - z)
         total += np.power(1 + square / model.STREET_LAMP_M**2, -1.5)
-    # Day's sky shows in the gaps of leaves.
-    gaps = leaves * _ramp(rgb.mean(axis=2), 0.35, 0.65)
-    return (model.STREET_BASE + (1 - model.STREET_BASE) * np.minimum(total, 1.2)) * (1 - 0.9 * gaps)
+    return model.STREET_BASE + (1 - model.STREET_BASE) * np.minimum(total, 1.2)
 
 
 def _street_posts() -> list[tuple[float, float]]:
     """Places (x, z) m of street lamps."""
-    steps = np.arange(0.6, model.STREET_FAR_M / model.STREET_EVERY_M)
-    return [
-        (float((-1) ** k) * model.STREET_ASIDE_M, float(step) * model.STREET_EVERY_M)
-        for k, step in enumerate(steps)
-    ]
+    steps = np.arange(0.6, model.STREET_FAR_M / model.STREET_EVERY_M, 0.5)
+    sides = np.where(np.arange(len(steps)) % 2, -model.STREET_ASIDE_M, model.STREET_ASIDE_M)
+    return list(zip(sides.tolist(), (model.STREET_EVERY_M * steps).tolist(), strict=True))
 
 
 def _street_lamps(scene: SceneIR, depth_m: np.ndarray, camera_m: float) -> np.ndarray:

@@ -236,7 +236,7 @@ def _select_object(objects: Objects, index: int) -> Objects:
     """Object `index` alone, without source."""
     names = (
         "mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d", "truncation",
-        "occlusion",
+        "occlusion", "lamps",
     )  # fmt: skip
     return replace(objects, source=(), **{n: getattr(objects, n)[index : index + 1] for n in names})
 

@@ -37,6 +37,8 @@ LOADED_WHERE_USED = (
     "art",
     "mitsuba",
     "timm",
+    "maite",
+    "supervision",
 )
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from detectors import registry
 from detectors.base import DetectorError
 from detectors.files import read_state
 from detectors.registry import SHIPPED, load_detector, load_predictor, read_weights, save_detector, write_weights
@@ -63,7 +64,7 @@ def test_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
         DetectorError,
         match=r"detector: expected squeezedet, yolov3-slim, a path\.safetensors, or a name with prefix darknet:, "
-        r".*, module:, ensemble: or planted:, found 'yolo9'$",
+        r".*, module:, maite:, ensemble: or planted:, found 'yolo9'$",
     ):
         load_detector("yolo9")
 
@@ -214,3 +215,38 @@ def test_a_file_with_a_comma_in_its_name(tmp_path: Path) -> None:
     assert load_predictor(f"module:{path}:Own,{spec}").classes == ("Car", "bus")
     with pytest.raises(DetectorError, match=r"a,b/none\.onnx"):
         load_predictor(f"onnx:{folder}/none.onnx")
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "spec"),
+    [
+        ("onnx:a,b/net,1.onnx", ["a,b/net,1.onnx"], None),
+        ("onnx:a,b/net,1.onnx,a,b/net,1.yaml", ["a,b/net,1.onnx"], "a,b/net,1.yaml"),
+        ("onnx:a,b/net,1.onnx,gone.yaml", ["a,b/net,1.onnx"], "gone.yaml"),
+        ("hf:a,b", ["a,b"], None),
+        ("hf:a,b,a,b/net,1.yaml", ["a,b"], "a,b/net,1.yaml"),
+        ("hf:facebook/detr", ["facebook/detr"], None),
+        ("torchvision:fcos,a,b/net,1.onnx", ["fcos", "a,b/net,1.onnx"], None),
+        ("torchvision:fcos,a,b/net,1.onnx,a,b/net,1.yaml", ["fcos", "a,b/net,1.onnx"], "a,b/net,1.yaml"),
+        ("torchvision:fcos,net.yaml", ["fcos"], "net.yaml"),
+        ("torchvision:fcos,none,net.yaml", ["fcos", "none"], "net.yaml"),
+        ("torchvision:fcos", ["fcos"], None),
+    ],
+)
+def test_commas_in_detectors(
+    text: str, arguments: list[str], spec: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a,b").mkdir()
+    for name in ("a,b/net,1.onnx", "a,b/net,1.yaml", "net.yaml"):
+        Path(name).touch()
+    kind, _, rest = text.partition(":")
+    assert registry._split_arguments(kind, rest) == (arguments, None if spec is None else Path(spec))
+
+
+@pytest.mark.parametrize(
+    "text", ["onnx:a,b.onnx", "hf:a,b", "torchvision:a,b,c,d.pth", "ultralytics:a,b.pt", "onnx:"]
+)
+def test_commas_between_files_that_do_not_exist(text: str) -> None:
+    with pytest.raises(DetectorError, match=r"detector: expected \w+:WHAT(\[,WEIGHTS\])?\[,SPEC\.yaml\], found '"):
+        load_predictor(text)

@@ -172,7 +172,10 @@ def test_a_scene_says_what_is_changed(scene: ds.Scene) -> None:
         },
         abs=1e-5,
     )
-    assert changed.weather == pytest.approx({"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4})
+    assert changed.weather == pytest.approx({"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4, "night": 0})
+    by_night = scene.edit("objects[1].lamps=off", weather="fog=0.6,night=1")
+    assert by_night.theta == pytest.approx({"weather.fog": 0.6, "weather.night": 1.0, "objects[1].lamps": -1.0})
+    assert scene.edit(weather="night").render().mean() < 0.5 * scene.render().mean()
     moved = np.abs(changed.boxes() - scene.boxes()).max(axis=1) > 0.01
     assert moved.tolist() == [True, True, False, False, False, False]
 
@@ -199,10 +202,7 @@ def test_detections_margins_and_gradients(scene: ds.Scene) -> None:
     ("objective", "error"),
     [
         ("objectness", 0.25),  # the IoU that its targets depend on counts as constant
-        (
-            lambda candidates, *_: -candidates.log_scores[:, 0].mean(),
-            0.01,
-        ),  # of all anchors: no score is saturated
+        (lambda candidates, *_: -candidates.log_scores[:, 0].mean(), 0.01),  # of all anchors: none is saturated
     ],
 )
 def test_gradients_are_central_differences(scene: ds.Scene, objective: Any, error: float) -> None:
@@ -269,6 +269,46 @@ class Blobs(torch.nn.Module):
         return boxes, torch.stack((dark, -dark), -1).sigmoid()
 
 
+class OwnNetwork(torch.nn.Module):
+    """The bundled network as somebody else's: boxes (1, A, 4) px and probabilities (1, A, C)."""
+
+    def __init__(self, through_numpy: bool) -> None:
+        super().__init__()
+        self.inner = ds.load_detector("squeezedet")
+        self.spec = {"classes": list(self.inner.classes)}
+        self.through_numpy = through_numpy
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        if self.through_numpy:
+            images = torch.from_numpy(images.numpy())
+        found = self.inner.candidates(self.inner(images))
+        best = found.log_scores.amax(1).topk(200).indices
+        return found.boxes_xyxy[None, best, 0], found.log_scores[None, best].exp()
+
+
+def test_a_module_is_attacked_by_its_gradient(scene: ds.Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    found = ds.attack(
+        scene, OwnNetwork(through_numpy=False), params="color", steps=1, confirm=False, nuisances="off"
+    )
+    assert found.config.method == "si-fgsm"
+    assert len(found.result.found_before) > 2
+    assert found.result.loss_trace[-1] > found.result.loss_trace[0]
+    assert "gradient" not in capsys.readouterr().err
+
+
+def test_a_module_without_gradient_is_attacked_without_one(
+    scene: ds.Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = ds.attack(
+        scene, OwnNetwork(through_numpy=True), params="color", passes=24, confirm=False, nuisances="off"
+    )
+    assert found.config.method == "climb"
+    assert any(found.theta.values())
+    reason = "its outputs do not depend on the image by torch's operations"
+    line = f"OwnNetwork has no gradient ({reason}): method climb takes the place of si-fgsm"
+    assert line in capsys.readouterr().err.splitlines()
+
+
 def test_edits_are_the_commands(scene: ds.Scene, tmp_path: Path) -> None:
     scene.save(tmp_path / "scene")
     loaded = ds.load_scene(tmp_path / "scene")  # tensors' layout in memory decides how fog's last bits are rounded
@@ -287,7 +327,7 @@ def test_edits_are_the_commands(scene: ds.Scene, tmp_path: Path) -> None:
     [
         ((), {}, UsageError, "edit: expected a change"),
         (("objects[1].fly=1",), {}, FormatError, "edit objects\\[1\\].fly=1"),
-        ((), {"weather": "hail"}, FormatError, "edit: weather: expected codes, or one of"),
+        ((), {"weather": "hail"}, FormatError, "edit: weather: expected codes such as fog"),
         ((), {"remove": [99]}, RangeError, "objects\\[99\\]"),
         ((), {"remove": "some"}, UsageError, "remove: expected rows from 0, or 'all'"),
     ],

@@ -173,6 +173,13 @@ def test_perturbed_tensors_are_saved_without_their_gradient(tmp_path: Path) -> N
     assert not loaded.objects.yaw.requires_grad
 
 
+def test_a_scene_with_the_codes_of_daylight_is_night_0(tmp_path: Path) -> None:
+    scene = rich_scene()
+    save_scene(scene, tmp_path / "scene")
+    edit("environment", "weather", value=[0.1, 0.2, 0.3, 0.4])(tmp_path / "scene")
+    assert load_scene(tmp_path / "scene").environment.weather.tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.0])
+
+
 def test_eight_bit_photograph_is_a_png_and_others_are_not(tmp_path: Path) -> None:
     save_scene(rich_scene(), tmp_path / "scene")
     assert (tmp_path / "scene" / "photograph.png").exists()

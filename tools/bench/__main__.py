@@ -16,6 +16,7 @@ from typing import Any
 from detectors.base import DetectorError
 from detectors.registry import SHIPPED, load_detector, load_predictor
 from drivesem import __version__
+from drivesem.analysis.transfer import parse_detector_names
 from drivesem.attacks.space import parse_params
 from drivesem.bench import render
 from drivesem.bench.scenes import MAX_CARS
@@ -30,6 +31,7 @@ from drivesem.run.driver import ProgressSettings, run_frame_jobs
 from scene_ir.derender.derender import DerenderSettings
 from tools.bench import (
     climb,
+    conditions,
     depth,
     derender,
     devices,
@@ -51,7 +53,7 @@ from tools.bench import (
 )
 from tools.bench import detector as detectors
 from tools.bench.planted import across, across_report, summary, yardstick
-from tools.bench.settings import BenchTool, DetectorBenchConfig, GradcheckConfig
+from tools.bench.settings import BenchTool, ConditionsConfig, DetectorBenchConfig, GradcheckConfig
 
 _PROGRAM = "python -m tools.bench"
 _RIVAL_SECONDS = (16.0, 180.0)
@@ -74,9 +76,33 @@ def _load_benchmark(name: str) -> Callable[[Any], int]:
     return gradcheck.run if name == "gradcheck" else partial(_run, _MEASURES[name])
 
 
-def _run(measure: Callable[[Any, Console], BenchResult], config: BenchTool | DetectorBenchConfig) -> int:
+def _conditions(config: ConditionsConfig, console: Console) -> BenchResult:
+    detectors_of_recall = conditions.load_detectors(config.detectors, config.tiles) if config.recall else []
+    frames, notes = conditions.collect_frames(config)
+    console.print(f"{format_count(len(frames), 'frame')}, real ones of half {config.half}")
+    for note in notes:
+        console.print(note)
+    judged = [frame for frame in frames if frame.condition != conditions.DAY]
+    rows = list(show_progress(conditions.measure(config, judged), len(judged), console))
+    fields: dict[str, Any] = {
+        "half": config.half,
+        "notes": notes,
+        "rows": conditions.measure_rows(rows, config.bootstrap, config.seed),
+        "probe": conditions.probe_rows(rows, config.bootstrap, config.seed),
+    }
+    if config.recall:
+        detected = conditions.detect_frames(config, detectors_of_recall, frames)
+        hits = list(show_progress(detected, len(frames) * len(detectors_of_recall), console))
+        fields["recall"] = conditions.recall_rows(hits, config.bootstrap, config.seed)
+    conditions.write_sheets(judged, Path(config.out or ""))
+    return BenchResult({**fields, "method": conditions.METHOD}, conditions.tables(config.half, fields))
+
+
+def _run(
+    measure: Callable[[Any, Console], BenchResult], config: BenchTool | ConditionsConfig | DetectorBenchConfig
+) -> int:
     """Measure, print, write; exit code 0. Raises UsageError, SceneError or DetectorError for bad input."""
-    if max(parse_integers("--cars", config.cars)) > MAX_CARS:
+    if not isinstance(config, ConditionsConfig) and max(parse_integers("--cars", config.cars)) > MAX_CARS:
         raise UsageError("--cars", f"at most {MAX_CARS}", max(parse_integers("--cars", config.cars)))
     return run_benchmark(config, _PROGRAM, measure)
 
@@ -224,6 +250,14 @@ def _install(config: BenchTool, console: Console) -> BenchResult:
     names = ("steps", "sizes", "starts")
     fields = {name: table_rows for name, (_, _, table_rows) in zip(names, of_kind, strict=True)}
     return BenchResult({**fields, "method": install.METHOD}, sections)
+
+
+def _paths(config: BenchTool, console: Console) -> BenchResult:
+    _on_cpu(config)
+    detectors = parse_detector_names(config.detector, "--detector")
+    rows = [asdict(row) for row in show_progress(install.measure_paths(detectors), len(detectors), console)]
+    table = BenchTable(install.PATHS_TITLE, install.PATHS, rows)
+    return BenchResult({"rows": rows, "method": install.PATHS_METHOD}, [table])
 
 
 def _memory(config: DetectorBenchConfig, console: Console) -> BenchResult:
@@ -401,15 +435,18 @@ _MEASURES: dict[str, Callable[[Any, Console], BenchResult]] = {
     "eval": _eval,
     "viewer": _viewer,
     "install": _install,
+    "paths": _paths,
     "memory": _memory,
     "detector": _detector,
     "climb": _climb,
+    "conditions": _conditions,
     "planted": _planted,
     "scale": _scale,
 }
 BENCHMARKS: dict[str, type[CommandConfig]] = {
     "gradcheck": GradcheckConfig,
     **dict.fromkeys(_MEASURES, BenchTool),
+    "conditions": ConditionsConfig,
     **dict.fromkeys(("memory", "detector", "climb", "planted", "scale"), DetectorBenchConfig),
 }
 """Settings of each benchmark."""

@@ -22,6 +22,24 @@ STARTS: Columns = {
     "command": ("command", "command"), "repetitions": ("starts", "starts"), "first": ("first, s", "first"),
     "seconds": ("s", "s"), "iqr": ("IQR", "IQR"),
 }  # fmt: skip
+PATHS_TITLE = "From a clone to a report of your detector"
+PATHS: Columns = {
+    "detector": ("detector", "detector"), "lines": ("lines typed", "lines"), "install": ("install, s", "install"),
+    "check": ("check, s", "check"), "attack": ("attack, s", "attack"), "minutes": ("minutes", "min"),
+    "outcome": ("outcome", "outcome"),
+}  # fmt: skip
+PATHS_METHOD = (
+    "For each detector of --detector, five lines are typed one after another into a fresh folder: git clone of this "
+    "repository as committed; a virtual environment; pip install with the tested versions and the extra of the "
+    "detector's kind; drivesem check; drivesem attack on two generated streets, which compiles the renderer's "
+    "kernels first and writes the report. Seconds of the clock; install: the first three lines. pip's own settings "
+    "and cache count. A line that fails ends the path, with its last message as the outcome."
+)
+EXTRAS = {
+    "onnx": "onnx", "onnx-runtime": "onnx", "hf": "transformers", "ultralytics": "ultralytics",
+    "torchvision": "torchvision",
+}  # fmt: skip
+"""Extras of drivesem that kinds of detectors need."""
 METHOD = (
     "The README's words, typed one after another into a fresh folder: git clone of this repository as committed; "
     "a virtual environment; pip install with the tested versions, by pip's own settings and cache; the README's "
@@ -80,6 +98,25 @@ class StartRow:
     """Of the others."""
 
 
+@dataclass(frozen=True, slots=True)
+class DetectorPathRow:
+    """A new user's way to the report of one detector."""
+
+    detector: str
+    """As typed, without folders."""
+    lines: int
+    install: float
+    """Seconds."""
+    check: float
+    """Seconds."""
+    attack: float
+    """Seconds; 0 if an earlier line failed."""
+    minutes: float
+    """Of all lines."""
+    outcome: str
+    """Report, or the message of the line that failed."""
+
+
 Row = InstallStepRow | SizeRow | StartRow
 
 
@@ -91,7 +128,7 @@ def measure(quick: bool, run: Run = run_words) -> Iterator[Row]:
         if quick:
             python, folder = sys.executable, ROOT
         else:
-            python, folder = str(work / "environment" / "bin" / "python"), work / "clone"
+            python, folder = _own_python(work), work / "clone"
             yield from _steps(work, run)
         yield from _sizes(python, work, run)
         for words in _commands(python, work, attack=not quick):
@@ -100,26 +137,11 @@ def measure(quick: bool, run: Run = run_words) -> Iterator[Row]:
 
 def _steps(work: Path, run: Run) -> Iterator[InstallStepRow]:
     """A clone, an environment, an installation, an attack, and their sum."""
-    clone, environment = work / "clone", work / "environment"
-    own = str(environment / "bin" / "python")
-    steps: list[tuple[str, Sequence[str], Path, Path]] = [
-        ("git clone", ["git", "clone", "-q", str(ROOT), str(clone)], work, clone),
-        ("python3 -m venv", [sys.executable, "-m", "venv", str(environment)], work, environment),
-        (
-            "pip install -c constraints.txt -e .",
-            [own, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."],
-            clone,
-            environment,
-        ),
-        (
-            f"drivesem {' '.join(ATTACK)}",
-            [*_kernels(work), own, "-m", "drivesem.cli", *ATTACK],
-            clone,
-            clone / "runs",
-        ),
-    ]
+    clone = work / "clone"
+    words = [*_kernels(work), _own_python(work), "-m", "drivesem.cli", *ATTACK]
+    attack = (f"drivesem {' '.join(ATTACK)}", words, clone, clone / "runs")
     rows: list[InstallStepRow] = []
-    for name, words, folder, place in steps:
+    for name, words, folder, place in (*_installation(work), attack):
         before = _mb(place)
         taken, _ = _timed(words, folder, run)
         rows.append(InstallStepRow(name, round(taken, 1), round(_mb(place) - before, 1)))
@@ -127,6 +149,56 @@ def _steps(work: Path, run: Run) -> Iterator[InstallStepRow]:
     yield InstallStepRow(
         "in all", round(sum(row.seconds for row in rows), 1), round(sum(row.mb for row in rows), 1)
     )
+
+
+def measure_paths(detectors: Sequence[str], run: Run = run_words) -> Iterator[DetectorPathRow]:
+    """A row for each detector, as they are known."""
+    for detector in detectors:
+        with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as made:
+            yield _detector_path(detector, Path(made), run)
+
+
+def _detector_path(detector: str, work: Path, run: Run) -> DetectorPathRow:
+    program = [*_kernels(work), _own_python(work), "-m", "drivesem.cli"]
+    given, out = ["--detector", detector], work / "run"
+    steps = [
+        *(
+            ("install", words, folder)
+            for _, words, folder, _ in _installation(work, EXTRAS.get(detector.partition(":")[0]))
+        ),
+        ("check", [*program, "check", *given], Path.cwd()),
+        ("attack", [*program, "attack", *given, "--limit", "2", "--out", str(out)], Path.cwd()),
+    ]
+    seconds, outcome = dict.fromkeys(("install", "check", "attack"), 0.0), "report"
+    for part, words, folder in steps:
+        start = time.perf_counter()
+        failed = run(words, folder).failed
+        seconds[part] += time.perf_counter() - start
+        if failed or (part == "attack" and not (out / "report.html").is_file()):
+            outcome = f"{part}: {failed or 'no report'}"
+            break
+    minutes = round(sum(seconds.values()) / 60, 1)
+    rounded = {part: round(value, 1) for part, value in seconds.items()}
+    kind, colon, rest = detector.partition(":")
+    return DetectorPathRow(
+        f"{kind}{colon}{Path(rest).name if colon else ''}", len(steps), **rounded, minutes=minutes, outcome=outcome
+    )
+
+
+def _installation(work: Path, extra: str | None = None) -> list[tuple[str, Sequence[str], Path, Path]]:
+    """Name, words, folder and place of what is made: a clone, an environment, an installation."""
+    clone, environment = work / "clone", work / "environment"
+    target = f".[{extra}]" if extra else "."
+    install = [_own_python(work), "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", target]
+    return [
+        ("git clone", ["git", "clone", "-q", str(ROOT), str(clone)], work, clone),
+        ("python3 -m venv", [sys.executable, "-m", "venv", str(environment)], work, environment),
+        (f"pip install -c constraints.txt -e {target}", install, clone, environment),
+    ]
+
+
+def _own_python(work: Path) -> str:
+    return str(work / "environment" / "bin" / "python")
 
 
 def _kernels(work: Path) -> list[str]:

@@ -36,7 +36,7 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     weather, foliage: the compositor against the generator; synth: the scene generator; rivals: other renderers
     against the project's; devices: a GPU (--device) against the processor; eval: drivesem eval of many frames
     against pycocotools; viewer: response time of drivesem view to a slider; install: megabytes and seconds from a
-    clone to the first report, and of each start."""
+    clone to the first report, and of each start; paths: minutes from a clone to the report of each --detector."""
     quick: Flag = False
     """Fewer repetitions or frames."""
     cars: Annotated[str, ParsedBy(parse_integers)] = "1,4,8,16"
@@ -54,7 +54,8 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     threads: Count | None = None
     """Threads of torch and of the kernels (default: torch's choice)."""
     detector: str = "squeezedet"
-    """devices, found, moves, redraw, weather, viewer: a shipped detector, a .safetensors file of one, or onnx:FILE."""
+    """devices, found, moves, redraw, weather, viewer: a shipped detector, a .safetensors file of one, or onnx:FILE.
+    paths: detectors of any kind, with commas."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
     """found, label-free, parts, redraw, depth: demo (generated scenes; needs no data), kitti, vkitti1, vkitti2, coco
     or yolo."""
@@ -114,6 +115,48 @@ class DetectorBenchConfig(BenchOptions):
         refuse(self.across is None and self.searched is not None, "--searched", "--across", self.searched)
         demo = self.what == "planted" or self.dataset == DEMO
         refuse(not demo, "--dataset", "--dataset demo, but for planted", self.dataset)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConditionsConfig(TileOption, FrameCommandConfig):
+    """Compare drawn weather with real frames in it."""
+
+    what: CommandName = ""
+    """Benchmark. conditions: light, colour, sharpness, noise and lamps of drawn and real frames by condition, a probe
+    that separates them, sheets of both, and detectors' recalls."""
+    dataset: Annotated[str, OneOf(("bdd100k", "coco"))] = "coco"
+    """Layout of --root: bdd100k or coco, with the attributes weather and timeofday."""
+    root: str | None = None
+    """Folder of BDD100K's frames."""
+    fog_root: str | None = None
+    """Folder of real frames in fog (DAWN) in COCO's layout."""
+    half: Annotated[str, OneOf(("A", "B", "all"))] = "B"
+    """Half of the real frames, by a hash of their names: A (constants may be chosen on it), B (for reports), or all."""
+    frames: Count = 24
+    """Drawn frames of each condition."""
+    real: Count = 48
+    """Most real frames of each condition, in the order of the hash."""
+    full: Flag = False
+    """Draw each weather with its own code at 1, and no other code, instead of its preset."""
+    redraw: Flag = False
+    """Draw the pictures in --out again, after a change of the renderer. To de-render again, delete --out/scenes."""
+    recall: Flag = False
+    """Measure detectors' recalls too."""
+    detectors: str = "squeezedet,yolov3-slim"
+    """Detectors of --recall, with commas; NAME@SCORE sets a threshold other than t*."""
+    bootstrap: Annotated[Count, at_least(10)] = 400
+    """Bootstrap draws."""
+    threads: Count | None = None
+    """Threads of torch (default: torch's choice)."""
+    markdown: str | None = None
+    """Markdown file in which this benchmark's section is replaced."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.root is None, "--root", "the folder of BDD100K's frames", "nothing")
+        refuse(self.out is None, "--out", "a folder for scenes, pictures and sheets", "nothing")
+        refuse(self.out is not None and self.out.endswith(".json"), "--out", "a folder", self.out)
+        refuse(self.device != "cpu", "--device", "cpu", self.device)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,6 +67,7 @@ FEATURE_TEXT = {
     "weather.time_of_day": "time, 0 as photographed to 1 twilight: {}",
     "weather.overcast": "sky, 0 as photographed to 1 overcast: {}",
     "weather.night": "night, 0 as photographed to 1 street lamps only: {}",
+    "lamps": "lamps, -1 off, 0 as the weather has them, 1 braking: {}",
     "foliage.hue": "leaves, hue from -1 to 1: {}",
     "foliage.lightness": "leaves, -1 darker to 1 lighter: {}",
     "foliage.density": "leaves, -1 sparser to 1 denser: {}",

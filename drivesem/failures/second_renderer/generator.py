@@ -186,6 +186,8 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
             mesh=tuple(ffd.to_symmetric(bend).tolist()) if bool(bend.any()) else (),
             size=grown,
         )
+    if not torch.equal(after.lamps, before.lamps):
+        missing.append("lamps: generated vehicles are drawn without")
     environment, then = changed.environment, still.environment
     if bool(environment.weather[Weather.NIGHT] != then.weather[Weather.NIGHT]):
         missing.append("night: generated streets are drawn by daylight")

@@ -50,8 +50,8 @@ _LAMPS_LIT = np.array([1.5, 1.2, 1.5, 0.3, 3.0], np.float32)
 """How much each code of weather makes drivers switch on their lamps."""
 _TAIL, _HEAD = np.array([2.0, 0.1, 0.05], np.float32), np.array([6.0, 5.5, 4.5], np.float32)
 """Light of a vehicle's lamps by night; white is 1."""
-_LAMP_M, _LAMP_BY_DAY = 0.09, 0.15
-"""Radius of a lamp; its light by day, relative to that by night."""
+_LAMP_M, _LAMP_BY_DAY, _BRAKING = 0.09, 0.15, 2.5
+"""Radius of a lamp; its light by day, relative to that by night; light of a brake lamp, relative to a tail lamp's."""
 
 _AUTUMN, _SPRING, _MAX_TURN = 28.0, 150.0, 65.0
 """Hues in degrees towards which hue codes 1 and -1 turn the leaves; largest turn."""
@@ -194,6 +194,7 @@ def apply_night(
     environment: Environment,
     camera: PictureCamera,
     poses: Sequence[VehiclePose],
+    codes: Array,
 ) -> Array:
     """Apply the environment's night, and switch on the vehicles' lamps as its weather makes drivers do.
 
@@ -204,12 +205,13 @@ def apply_night(
         environment: Weather, sky and ground.
         camera: Camera.
         poses: Poses of the vehicles.
+        codes: (N,) codes of their lamps.
 
     Returns:
         (H, W, 3) RGB, at least 0.
     """
     weather = to_numpy(environment.weather)
-    if not weather.any():
+    if not (weather.any() or codes.any()):
         return image
     night = 1 - (1 - float(weather[Weather.NIGHT])) ** 4
     light = np.clip(image, 0, None) ** _GAMMA
@@ -226,34 +228,40 @@ def apply_night(
         lit = light / (1 + light) * (0.6 * _STREET + beam[..., None] * _HEADLAMPS)
         sky = (to_numpy(environment.sky) * (owner == 0))[..., None]
         light = light + night * (lit + sky * (_TOWN_GLOW - lit) - light)
-    strength = (1 - np.exp(-(float(_LAMPS_LIT @ weather) ** 2))) * (_LAMP_BY_DAY + (1 - _LAMP_BY_DAY) * night)
-    clear = float(_FOG_PER_M * weather[Weather.FOG] + _RAIN_PER_M * weather[Weather.RAIN])
+    driven = 1 - np.exp(-(float(_LAMPS_LIT @ weather) ** 2))
+    extinction = float(_FOG_PER_M * weather[Weather.FOG] + _RAIN_PER_M * weather[Weather.RAIN])
     lamps = np.zeros_like(light)
     for i, pose in enumerate(poses):
-        _draw_lamps(lamps, owner == i + 1, pose, camera, clear)
-    glare = cv2.GaussianBlur(lamps, (0, 0), 0.01 * camera.height) + cv2.GaussianBlur(
-        lamps, (0, 0), 0.04 * camera.height
-    )
-    return ((light + strength * (lamps + 0.3 * glare)) ** (1 / _GAMMA)).astype(np.float32)
+        code = float(codes[i])
+        levels = driven * (1 + min(code, 0)) + np.array([0, _BRAKING * max(code, 0)])
+        _draw_lamps(lamps, owner == i + 1, pose, camera, extinction, levels)
+    glare = sum(cv2.GaussianBlur(lamps, (0, 0), width * camera.height) for width in (0.01, 0.04))
+    exposure = _LAMP_BY_DAY + (1 - _LAMP_BY_DAY) * night
+    return ((light + exposure * (lamps + 0.3 * glare)) ** (1 / _GAMMA)).astype(np.float32)
 
 
 def _draw_lamps(
-    lamps: Array, seen: NDArray[np.bool_], pose: VehiclePose, camera: PictureCamera, extinction: float
+    lamps: Array,
+    seen: NDArray[np.bool_],
+    pose: VehiclePose,
+    camera: PictureCamera,
+    extinction: float,
+    levels: Array,
 ) -> None:
-    """Add the light of a vehicle's visible lamps, discs at usual places of its box."""
+    """Add the light of a vehicle's visible lamps, discs at usual places of its box; levels: (2,) front and rear."""
     for along, across in ((0.48, 0.38), (0.48, -0.38), (-0.48, 0.38), (-0.48, -0.38)):
         local = np.array([along, -0.5, across], np.float32) * pose.size_lhw
         place = pose.rotation() @ local + pose.translation + camera.shift_m
         facing = float(pose.rotation()[:, 0] @ -place) * np.sign(along) / max(float(np.linalg.norm(place)), 1e-6)
         if place[2] < 1 or facing <= 0:
             continue
-        x, y = (round(float(v)) for v in camera.project(place))
-        if not (0 <= x < camera.width and 0 <= y < camera.height and seen[y, x]):
+        x, y = (round(float(v)) for v in camera.project(place.astype(np.float32)))
+        if not seen[max(y - 2, 0) : max(y + 3, 0), max(x - 2, 0) : max(x + 3, 0)].any():
             continue
         disc = np.zeros(seen.shape, np.uint8)
         radius = max(_LAMP_M * float(camera.intrinsics[0, 0]) / float(place[2]), 0.7)
         cv2.circle(disc, (x, y), round(radius), 1, -1)
-        colour = _HEAD * facing**4 if along > 0 else _TAIL * min(2 * facing, 1)
+        colour = levels[0] * _HEAD * facing**4 if along > 0 else levels[1] * _TAIL * min(2 * facing, 1)
         lamps[(disc > 0) & seen] += colour * np.exp(-extinction * place[2])
 
 

@@ -48,6 +48,7 @@ _PARAMETERS = {
     "ffd": "mesh",
     "size": "size",
     "sun": "sun",
+    "lamps": "lamps",
 }
 """Parameter by the first word of a coordinate's name after its object."""
 _FAILED = ("lost", "phantom")

@@ -20,7 +20,6 @@ from torch.autograd.function import once_differentiable
 from scene_ir.raster.launch import Floats, launch, split_range, start_warp, threads
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, store, store3, sum3
 from scene_ir.render import model
-from scene_ir.render.environment import low_sun_share
 from scene_ir.render.kernels.colour import (
     clamp01,
     clamp01_adjoint,
@@ -902,17 +901,18 @@ class _Foliage(torch.autograd.Function):
 
 
 def apply_weather(
-    image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, streaks: Tensor
+    image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, low_sun: Tensor, streaks: Tensor
 ) -> Tensor:
     """See `environment.apply_weather`; float32, the airlight constant.
 
     Args:
         image, inverse, environment, air: As there.
+        low_sun: () of `environment.low_sun_share`.
         streaks: (H, W) in [0, 1].
     """
     code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
     fog, rain, time, overcast = code[:DAYLIGHT_DIM]
-    code = torch.stack([fog, rain, time, overcast, low_sun_share(fog, rain, overcast)])
+    code = torch.stack([fog, rain, time, overcast, low_sun])
     return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
 
 

@@ -22,7 +22,7 @@ wp.set_module_options(SIMD_OPTIONS)
 NEAREST, BEND = 1.0 / model.HAZE_CAP_M, model.NIGHT_BEND**2
 CUT_M, SOFT_M, ABOVE, BELOW = model.HEAD_CUT_M, model.HEAD_SOFT_M, model.HEAD_ABOVE, 1.0 - model.HEAD_ABOVE
 FAR = 1.0 / model.HEAD_FAR_M**2
-SOFTENED, LIT_GAIN = model.SUN_SOFTENED, model.LIT_GAIN
+SOFTENED, RETRO_WHITE, LIT_GAIN = model.SUN_SOFTENED, model.RETRO_WHITE, model.LIT_GAIN
 NOISE_BLACK, NOISE_LEVEL = model.NOISE, model.NOISE_LEVEL
 STREET_RGB = wp.constant(wp.vec3f(*model.STREET_RGB))
 HEAD_RGB = wp.constant(wp.vec3f(*model.HEAD_RGB))
@@ -51,8 +51,14 @@ def _soft_day(day: wp.vec3f):
 
 
 @wp.func
-def _lamp_light(street: wp.float32, head: wp.float32, lit: wp.float32):
-    return street * STREET_RGB + head * HEAD_RGB + _splat(LIT_GAIN * lit)
+def _retro_day(day: wp.vec3f):
+    """What headlamps light: bright surfaces send more light back."""
+    return day + RETRO_WHITE * wp.cw_mul(day, wp.cw_mul(day, day))
+
+
+@wp.func
+def _street_light(street: wp.float32, lit: wp.float32):
+    return street * STREET_RGB + _splat(LIT_GAIN * lit)
 
 
 @wp.kernel
@@ -78,7 +84,8 @@ def _night_kernel(
     head = load(maps, AIM * plane + i) * (ABOVE + BELOW * below) / (1.0 + FAR * depth * depth)
     street = load(maps, STREET * plane + i)
     day = wp.cw_mul(x, x)
-    lamps = wp.cw_mul(_soft_day(day), _lamp_light(street, head, load(lit, i)))
+    lamps = wp.cw_mul(_soft_day(day), _street_light(street, load(lit, i)))
+    lamps = lamps + head * wp.cw_mul(_retro_day(day), HEAD_RGB)
     light = (
         lamps
         + load(sky, i) * (street * GLOW_RGB - lamps)
@@ -125,8 +132,10 @@ def _night_adjoint_kernel(
     open_sky = load(sky, i)
     day = wp.cw_mul(x, x)
     surface = _soft_day(day)
-    colour = _lamp_light(street, aim * cut * fall, load(lit, i))
-    lamps = wp.cw_mul(surface, colour)
+    colour = _street_light(street, load(lit, i))
+    head = aim * cut * fall
+    retro = _retro_day(day)
+    lamps = wp.cw_mul(surface, colour) + head * wp.cw_mul(retro, HEAD_RGB)
     glare = load3(maps, GLARE * plane + i, plane)
     light = lamps + open_sky * (street * GLOW_RGB - lamps) + load(settings, 1) * glare
     added = load3(vehicles, i, plane) + _splat(BEND)
@@ -146,8 +155,10 @@ def _night_adjoint_kernel(
     g_lamps = (1.0 - open_sky) * g_light
     g_colour = wp.cw_mul(g_lamps, surface)
     slope = wp.cw_div(_splat(1.0), _splat(1.0) + SOFTENED * day)
+    g_retro = wp.cw_mul(g_lamps, HEAD_RGB)
     g_day = (1.0 - share) * g_sum + wp.cw_mul(wp.cw_mul(g_lamps, colour), wp.cw_mul(slope, slope))
-    g_head = aim * wp.dot(g_colour, HEAD_RGB)
+    g_day = g_day + head * wp.cw_mul(g_retro, _splat(1.0) + (3.0 * RETRO_WHITE) * wp.cw_mul(day, day))
+    g_head = aim * wp.dot(g_retro, retro)
     bent = (-BELOW / SOFT_M) * below * (1.0 - below) * rise
     g_depth = g_head * (fall * bent - cut * 2.0 * FAR * depth * fall * fall)
     store3(grad_image, i, plane, g_dark + wp.cw_mul(x, 2.0 * g_day - wp.cw_div(g_dark, day_root)))

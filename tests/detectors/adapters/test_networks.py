@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from torch import nn
 
 from detectors.adapters.network import GradientFreePredictor, NetworkDetector
@@ -204,6 +205,41 @@ def test_missing_library_names_the_install_command(monkeypatch: pytest.MonkeyPat
         monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(DetectorError, match=advice):
             load_detector(f"{'hf' if library == 'transformers' else library}:{name}")
+
+
+class NormalisedNetwork(TinyNetwork):
+    """The same, with boxes along a row, as transformers make them of a batch normalisation."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(3)
+        with torch.no_grad():
+            self.norm.running_var.copy_(torch.tensor([0.5, 2.0, 4.0]))
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        rows = self.norm(self.head(images)).flatten(2).permute(0, 2, 1)
+        return torch.cat((self.boxes.permute(0, 2, 1), rows.sigmoid()), 2)
+
+
+@pytest.mark.parametrize("kind", ["module", "torchscript", "export"])
+def test_gradient_through_batch_normalisation_equals_differences(kind: str, tmp_path: Path) -> None:
+    network, image = NormalisedNetwork().eval(), torch.zeros(1, 3, SIDE, SIDE)
+    settings = f"size: {SIDE}\nclasses: {CLASSES}\nformat: yolov8\n"
+    (tmp_path / "net.yaml").write_text(settings)
+    if kind == "module":
+        network.spec = yaml.safe_load(settings)
+        detector = load_predictor(network)
+    else:
+        path = tmp_path / ("net.pt2" if kind == "export" else "net.pt")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if kind == "export":
+                torch.export.save(torch.export.export(network, (image,)), path)
+            else:
+                torch.jit.trace(network, image).save(str(path))
+        detector = load_detector(f"{kind}:{path}")
+    assert isinstance(detector, NetworkDetector)
+    check_detector(detector, (SIDE, SIDE)).require()
 
 
 class NumpyNetwork(TinyNetwork):

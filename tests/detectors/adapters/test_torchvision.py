@@ -52,7 +52,7 @@ def test_each_picture_keeps_to_its_own_proposals(settled: Callable[[str], Any]) 
     detector.model.transform.min_size = (96,)
     images = torch.rand(2, 3, 64, 96)
     raw = detector(images)
-    few = tuple(proposals[:count] for proposals, count in zip(raw.held, (3, 7), strict=True))
+    few = tuple(proposals[:count] for proposals, count in zip(raw.constants, (3, 7), strict=True))
     with detector.freeze_choices(replace(raw, constants=few)):
         cut = detector(images)
     assert cut.counts == (3, 7)

@@ -118,6 +118,18 @@ def test_darknet_files_by_name(mini: YoloV3, mini_text: str, tmp_path: Path) -> 
         load_detector(f"darknet:{path}")
 
 
+def test_darknet_files_with_commas_in_their_names(mini: YoloV3, tmp_path: Path) -> None:
+    folder = tmp_path / "a,b"
+    folder.mkdir()
+    darknet.save(mini, folder / "own,1.cfg")
+    (folder / "own,1.weights").rename(folder / "best,2.weights")
+    assert load_detector(f"darknet:{folder}/own,1.cfg,{folder}/best,2.weights").classes == mini.classes
+    with pytest.raises(DetectorError, match=r"own,1\.weights: expected Darknet weights, found No such file"):
+        load_detector(f"darknet:{folder}/own,1.cfg")
+    with pytest.raises(DetectorError, match=r"none: expected a Darknet \.cfg, found No such file"):
+        load_detector(f"darknet:{tmp_path}/none,1.cfg")
+
+
 def test_coco_names_where_there_are_eighty(tmp_path: Path) -> None:
     path = tmp_path / "coco.cfg"
     path.write_text(TWO.replace("classes=1", "classes=80").replace("filters=6", "filters=85"))

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivesem.attacks.budgets import PRESETS, change_limits, format_budget, parse_budget
+from drivesem.attacks.budgets import PRESETS, budget_for_coordinates, change_limits, format_budget, parse_budget
 from drivesem.attacks.feasibility_check import check_scene
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.space import PAPER_PARAMETERS, Budget, Parameter, ParameterSpace
@@ -156,9 +156,31 @@ def test_a_street_is_longer_along_than_across(street):
     papers = ParameterSpace(scene, PAPER_PARAMETERS, Budget(night=1.0))
     size = space.blocks.get(Parameter.SIZE)
     assert space.upper[size].tolist() == pytest.approx([0.1] * 4)
-    assert space.upper[size.stop :].tolist() == [1.0] * 3  # the sun's
+    assert space.upper[size.stop :].tolist() == [1.0] * 7  # the sun's and the lamps'
     wider = papers.upper != space.upper[: size.start]
     assert not bool(wider[: where.start].any() or wider[where.stop :].any())
+
+
+def test_a_street_has_nights_and_its_older_runs_have_none(street):
+    names = [f"weather.{name}" for name in ("fog", "rain", "time_of_day", "overcast")]
+    budget = parse_budget("street")
+    assert (budget.night, parse_budget("street,night=0.5").night, parse_budget("street,night=0").night) == (
+        1,
+        0.5,
+        0,
+    )
+    assert budget_for_coordinates(budget, [*names, "weather.night"]) == budget
+    older = budget_for_coordinates(budget, names)
+    assert older == parse_budget("street,night=0")
+    assert parse_budget(format_budget(older)) == older
+    space = ParameterSpace(street(), ("weather",), older)
+    assert [space.name(i) for i in range(space.dim)] == names
+    for preset in ("paper", "parking"):
+        assert budget_for_coordinates(PRESETS[preset], names) == PRESETS[preset]
+    with pytest.raises(FormatError, match=r"night: expected street,night=0\.5, since only street lets it change"):
+        parse_budget("night=0.5")
+    with pytest.raises(FormatError, match="night: expected a positive number of at most 1, found 2"):
+        parse_budget("street,night=2")
 
 
 def test_partly_visible_cars_have_the_papers_limits(street):

@@ -55,7 +55,7 @@ def test_moved_labels_at_theta0_are_the_benign_ones_to_the_bit(street, seed):
         occlusion=torch.randint(0, 4, (4,), generator=generator),
         ffd=0.02 * torch.randn(4, 64, 3, generator=generator),
     )
-    space = ParameterSpace(scene, tuple(Parameter), Budget(size=0.1, sun=1.0))
+    space = ParameterSpace(scene, tuple(Parameter), Budget(size=0.1, sun=1.0, lamps=1.0))
     moved = label_scene(scene, space.apply(scene, space.theta0))
     assert torch.equal(moved.boxes_xyxy, scene.objects.box2d)
     assert torch.equal(moved.truncation, scene.objects.truncation)

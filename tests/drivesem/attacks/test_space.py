@@ -19,7 +19,7 @@ from drivesem.attacks.space import (
 from scene_ir.errors import FormatError, RangeError, ShapeError
 
 ALL = tuple(Parameter)
-WIDE = Budget(size=0.1, sun=1.0, night=1.0)
+WIDE = Budget(size=0.1, sun=1.0, night=1.0, lamps=1.0)
 
 
 def test_parsed_parameters_are_in_thetas_order():
@@ -32,7 +32,7 @@ def test_parsed_parameters_are_in_thetas_order():
     [
         (
             "translate,spin",
-            "expected names among color, weather, foliage, translate, rotate, mesh, size, sun, found 'spin'",
+            "expected names among color, weather, foliage, translate, rotate, mesh, size, sun, lamps, found 'spin'",
         ),
         ("", "at least one of color"),
         ("mesh,mesh", "expected each parameter once"),
@@ -55,7 +55,7 @@ def test_unknown_combo_and_budget():
 
 def test_cardinality_bounds_and_steps(street):
     space = ParameterSpace(street(), ALL, WIDE)
-    assert space.dim == 4 * 5 + 5 + 3 + 4 * 2 + 4 * 1 + 4 * 96 + 4 * 1 + 3
+    assert space.dim == 4 * 5 + 5 + 3 + 4 * 2 + 4 * 1 + 4 * 96 + 4 * 1 + 3 + 4 * 1
     for tensor in (space.theta0, space.lower, space.upper, space.step):
         assert tuple(tensor.shape) == (space.dim,)
     assert bool((space.lower <= 0).all())
@@ -66,7 +66,7 @@ def test_cardinality_bounds_and_steps(street):
     steps = {p.value: float(space.step[space.blocks.get(p)][0]) for p in ALL}
     assert steps == pytest.approx(
         {"color": 0.05, "weather": 0.25, "foliage": 0.1, "translate": 0.01, "rotate": 0.01, "mesh": 0.025}
-        | {"size": 0.01, "sun": 0.1}
+        | {"size": 0.01, "sun": 0.1, "lamps": 0.25}
     )
 
 
@@ -168,6 +168,7 @@ def test_theta0_gives_the_same_scene_to_the_bit(street, dtype):
     same = space.apply(scene, space.theta0)
     for name in ("translation", "yaw", "ffd", "size_lhw", "texture_code"):
         assert torch.equal(getattr(same.objects, name), getattr(scene.objects, name)), name
+    assert torch.equal(same.objects.lamps, scene.objects.lamps)
     assert torch.equal(same.environment.weather, scene.environment.weather)
     assert torch.equal(same.environment.foliage, scene.environment.foliage)
     assert torch.equal(same.environment.light, scene.environment.light.to(dtype))
@@ -213,7 +214,7 @@ def test_apply_has_the_gradient_of_its_differences(street):
     scene = street(positions_xz=((0.0, 12.0),), dtype=torch.float64, tilt=0.03)
     space = ParameterSpace(scene, ALL, WIDE)
     generator = torch.Generator().manual_seed(5)
-    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 3, 5, 5, 3, 3)]
+    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 3, 5, 5, 3, 3, 1)]
 
     def functional(theta):
         s = space.apply(scene, theta)
@@ -224,6 +225,7 @@ def test_apply_has_the_gradient_of_its_differences(street):
             s.environment.weather,
             s.environment.foliage,
             s.environment.light,
+            s.objects.lamps,
         )
         return sum((w * f.reshape(-1).sin()).sum() for w, f in zip(weights, fields, strict=True))
 

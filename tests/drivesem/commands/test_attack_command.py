@@ -223,7 +223,7 @@ def test_a_detector_without_gradient_gets_a_method_without(
     ]
     words += ["--nuisances", "off", "--no-confirm", "--t-star", "0.2", "--out", str(tmp_path)]
     assert main(words) == 0
-    captured = "any has no gradient: --method climb takes the place of si-fgsm"
+    captured = "any has no gradient: method climb takes the place of si-fgsm"
     assert capsys.readouterr().err.splitlines()[0] == captured
     assert "method: climb" in (tmp_path / "config.yaml").read_text().splitlines()
     assert main(words) == 0  # and goes on in the same folder

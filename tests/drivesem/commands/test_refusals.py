@@ -59,7 +59,7 @@ REFUSALS = [
         "attack --detector retinanot",
         "--detector: expected a detector (squeezedet, yolov3-slim, a path.safetensors, or a name with prefix darknet:, "
         "onnx:, onnx-runtime:, hf:, torchvision:, ultralytics:, "
-        "torchscript:, export:, module:, ensemble: or planted:), found 'retinanot'",
+        "torchscript:, export:, module:, maite:, ensemble: or planted:), found 'retinanot'",
     ),
     ("attack --device quantum", "--device: expected a torch device of this machine, found 'quantum':"),
     ("attack --limt 3", "command line: expected options of drivesem ... found --limt; did you mean --limit?"),

@@ -119,7 +119,7 @@ def test_a_run_of_places_in_the_picture_agrees_goes_on_and_may_leave_the_ground(
         "--method",
         "random",
         "--queries",
-        "1",
+        "2",
         "--keep",
         "last",
         "--no-grade",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,25 @@ def test_the_sun_is_a_code_of_the_scene(street: Street) -> None:
         edit_of("sun.azimuth=2")
 
 
+def test_lamps_by_name_or_code(street: Street) -> None:
+    scene = street()
+    for text, code in (("off", -1.0), ("auto", 0.0), ("brake", 1.0), ("0.5", 0.5)):
+        after = apply_changes(scene, edit_of(f"objects[1].lamps={text}"))
+        assert after.objects.lamps.tolist() == [0.0, code, 0.0, 0.0]
+    assert parse_frame_edit("edit", {"objects": {1: {"lamps": False}}}).objects[1].lamps == -1.0
+    for text in ("blink", "2"):
+        with pytest.raises(FormatError, match=r"lamps?: expected off, auto, brake, or a code|expected off, auto"):
+            edit_of(f"objects[1].lamps={text}")
+
+
+def test_night_on_a_photograph_by_night_has_a_note(street: Street) -> None:
+    scene = street(positions_xz=())
+    edit = edit_of("weather=night")
+    note = "weather.night: the photograph is taken by night, so the code changes little"
+    assert note in apply_edit(replace(scene, photograph=torch.full_like(scene.photograph, 0.1)), edit).notes
+    assert note not in apply_edit(replace(scene, photograph=torch.full_like(scene.photograph, 0.5)), edit).notes
+
+
 def test_later_settings_of_the_same_parameter_win() -> None:
     assert edit_of("objects[1].rotate=1deg", "objects[1].rotate=2deg").objects[1].rotate == math.radians(2)
     both = edit_of("objects[1].rotate=1deg", "objects[1].translate=1m,0m").objects[1]
@@ -134,7 +154,10 @@ def test_bare_numbers_of_a_file_are_in_units_of_theta() -> None:
         ("objects[2].translate=1m", "object 2: translate: expected a list of 2"),
         ("objects[2].translate=1m,inf m", "expected a finite number, found 'inf '"),
         ("objects[2].rotate=fastdeg", "expected a finite number, found 'fast'"),
-        ("objects[2].wheels=4", "object 2: wheels: expected one of translate, rotate, color, mesh, size, remove"),
+        (
+            "objects[2].wheels=4",
+            "object 2: wheels: expected one of translate, rotate, color, mesh, size, lamps, remove",
+        ),
         ("objects[2].color=3,0,0,0,0", "expected 5 codes in"),
         ("objects[2].color=0,0", "color: expected a list of 5"),
         ("objects[2].remove=yes", "remove: expected true or false, found 'yes'"),

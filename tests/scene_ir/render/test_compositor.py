@@ -47,7 +47,7 @@ def _moved(scene: SceneIR, dx: float = 0.0, dz: float = 0.0, dyaw: float = 0.0) 
 
 def _only(objects: Objects, index: list[int]) -> Objects:
     names = ("mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d")
-    names += ("truncation", "occlusion")
+    names += ("lamps", "truncation", "occlusion")
     source = tuple(objects.source[i] for i in index) if objects.source else ()
     return replace(objects, source=source, **{n: getattr(objects, n)[index] for n in names})
 

@@ -149,7 +149,7 @@ def test_a_batch_equals_single_renders(photographed: SceneIR) -> None:
     scene = convert_scene(photographed, torch.float32)
     fewer = scene.with_objects(**{
         n: getattr(scene.objects, n)[:2]
-        for n in ("mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d",
+        for n in ("mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "lamps", "category", "box2d",
                   "truncation", "occlusion")
     }, source=scene.objects.source[:2])  # fmt: skip
     first, second = Compositor(scene), Compositor(with_regions(fewer))

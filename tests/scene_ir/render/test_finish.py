@@ -88,7 +88,7 @@ def test_all_vehicles_of_a_frame_have_one_sunlight(photographed: SceneIR) -> Non
 def test_samples_do_not_depend_on_other_objects(photographed: SceneIR, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a hidden car's completion, and the picture, would depend on the other objects."""
     monkeypatch.setattr("scene_ir.render.prepare._MAX_SAMPLES", 150)
-    names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "mesh_index", "category")
+    names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "lamps", "mesh_index", "category")
     names = (*names, "box2d", "truncation", "occlusion")
     objects, clear = photographed.objects, torch.zeros_like(photographed.depth)
     together = Compositor(photographed, hidden=[clear] * len(objects)).sample_photograph()[1]

@@ -68,7 +68,7 @@ def test_red_behind_and_white_in_front(compositor: Compositor) -> None:
     assert shares[ONCOMING] > 0.8
 
 
-def test_nothing_shines_through_what_stands_before_it(compositor: Compositor) -> None:
+def test_lamps_are_hidden_by_nearer_surfaces(compositor: Compositor) -> None:
     scene = compositor.scene
     number = compositor.render(scene).object_id
     environment = replace(scene.environment, weather=_code(night=1.0))
@@ -84,9 +84,9 @@ def test_parked_where_no_road_is_beyond_it(photographed: SceneIR) -> None:
     columns = torch.arange(photographed.camera.width)
     road = photographed.environment.road * (columns > 40)
     objects = photographed.objects
-    driven = [bool(lamps._is_driven(photographed, objects, i) > 0.5) for i in range(len(objects))]
-    beside = photographed.with_environment(road=road)
-    parked = [bool(lamps._is_driven(beside, objects, i) > 0.5) for i in range(len(objects))]
+    driven = [bool(lamps.is_driven(photographed, objects, i) > 0.5) for i in range(len(objects))]
+    narrower = photographed.with_environment(road=road)
+    parked = [bool(lamps.is_driven(narrower, objects, i) > 0.5) for i in range(len(objects))]
     assert driven == [True, True, True]
     assert parked == [False, True, True]
 
@@ -110,7 +110,7 @@ def test_a_wet_road_mirrors_them_below(compositor: Compositor) -> None:
 
 def test_on_the_photographs_own_lamp(photographed: SceneIR, compositor: Compositor) -> None:
     still = replace(compositor.lamps, shift_m=torch.zeros_like(compositor.lamps.shift_m))
-    xy, *_ = lamps._project_lamps(still, photographed, photographed.objects, compositor.centre)
+    xy, *_ = lamps.project_lamps(still, photographed, photographed.objects, compositor.centre)
     place = xy[AHEAD, 3].round().long() + torch.tensor([0, 1])
     source = photographed.objects.source[AHEAD]
     values, corner = source.foreground.values.clone(), [source.foreground.x0, source.foreground.y0]
@@ -120,15 +120,44 @@ def test_on_the_photographs_own_lamp(photographed: SceneIR, compositor: Composit
     sources[AHEAD] = replace(source, foreground=replace(source.foreground, values=values))
     painted = replace(photographed.objects, source=tuple(sources))
     found = lamps.find_lamps(photographed, painted, compositor.centre)
-    now, *_ = lamps._project_lamps(found, photographed, painted, compositor.centre)
+    now, *_ = lamps.project_lamps(found, photographed, painted, compositor.centre)
     assert now[AHEAD, 3].tolist() == pytest.approx(place.tolist(), abs=0.5)
     unmoved = found.shift_m[AHEAD, :2]
     assert not unmoved.any()  # its headlamps are not in the photograph
 
 
+def test_a_code_switches_them_off_and_brakes(compositor: Compositor) -> None:
+    scene = compositor.scene
+
+    def red_light(code: float, night: float) -> float:
+        lamps_code = torch.zeros(3, dtype=torch.float64)
+        lamps_code[AHEAD] = code
+        perturbed = scene.with_objects(lamps=lamps_code)
+        return float(_light(compositor, _code(night=night), perturbed)[0].sum())
+
+    assert red_light(0.0, 0.0) == 0.0
+    assert red_light(1.0, 0.0) > red_light(0.5, 0.0) > 0.05
+    assert red_light(-1.0, 1.0) < red_light(0.0, 1.0) < red_light(1.0, 1.0)
+    without = lamps.draw_lamps(
+        _without(compositor, AHEAD), scene, scene.objects, compositor.render(scene).object_id,
+        replace(scene.environment, weather=_code(night=1.0)), compositor.centre,
+    )  # fmt: skip
+    assert red_light(-1.0, 1.0) == pytest.approx(float(without[0].sum()), rel=0.01)
+
+
+def test_brake_lamps_by_day_change_their_surroundings_only(photographed: SceneIR) -> None:
+    compositor = Compositor(photographed, RenderSettings(backend="reference"))
+    code = torch.zeros(3, dtype=torch.float64)
+    code[AHEAD] = 1.0
+    change = compositor.render(photographed.with_objects(lamps=code)).image - compositor.render(photographed).image
+    assert float(change.amin()) > -1e-9
+    assert float(change[0].amax()) > 0.1
+    assert float(change[:, :10].abs().amax()) < 0.01
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_templates_know_their_lamps(kind: str) -> None:
-    places = lamps._lamp_places(template(kind))
+    places = lamps.find_lamp_places(template(kind))
     front, rear = places[:2], places[2:]
     assert bool((front[:, 0] > 0.3).all() and (rear[:, 0] < -0.3).all())
     assert bool((places[[0, 2], 2] > 0.15).all() and (places[[1, 3], 2] < -0.15).all())
@@ -140,13 +169,14 @@ def test_gradients_to_poses_and_weather_are_those_of_differences(compositor: Com
     number = compositor.render(scene).object_id
     weights = torch.randn(3, *number.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
-    def total(move: Tensor, turn: Tensor, bend: Tensor, code: Tensor) -> Tensor:
+    def total(move: Tensor, turn: Tensor, bend: Tensor, code: Tensor, on: Tensor) -> Tensor:
         objects = scene.objects
         moved = replace(
             objects,
             translation=objects.translation + move,
             yaw=objects.yaw + turn,
             ffd=objects.ffd + bend[:, None, None],
+            lamps=on,
         )
         environment = replace(scene.environment, weather=code)
         found = lamps.draw_lamps(compositor.lamps, scene, moved, number, environment, compositor.centre)
@@ -154,7 +184,8 @@ def test_gradients_to_poses_and_weather_are_those_of_differences(compositor: Com
 
     count = len(scene.objects)
     start = [torch.zeros(count, n, dtype=torch.float64).squeeze(1) for n in (3, 1, 1)]
-    start.append(_code(fog=0.3, rain=0.4, time=0.1, overcast=0.2, night=0.6))
+    start.append(torch.tensor([0.3, -0.4, 0.1], dtype=torch.float64))
+    start.insert(3, _code(fog=0.3, rain=0.4, time=0.1, overcast=0.2, night=0.6))
     assert torch.autograd.gradcheck(total, [t.requires_grad_() for t in start])
 
 

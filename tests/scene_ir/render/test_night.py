@@ -34,13 +34,14 @@ def _inputs(height: int, width: int) -> tuple[list[Tensor], night.NightMaps]:
     inverse = (noise(height, width) * 0.4 - 0.05).clamp(min=0.0)
     image = noise(3, height, width) * 1.1 - 0.05
     inputs = [image, inverse, noise(height, width), noise(height, width), 0.2 * noise(3, height, width)]
-    return inputs, night.NightMaps(maps, 1.6)
+    return inputs, night.NightMaps(maps, 1.6, 1.0)
 
 
 def _apply(inputs: list[Tensor], code: Tensor, maps: night.NightMaps, backend: str = "reference") -> Tensor:
     image, inverse, sky, lit, lamps = inputs
     blank = torch.zeros_like(sky)
-    environment = Environment(code, *(code.new_zeros(n) for n in (3, 3, 4)), sky, blank, blank)
+    none = code.new_zeros(3)
+    environment = Environment(code, none, none, code.new_zeros(4), sky, blank, blank)
     return night.apply_night(image, inverse, environment, lit, lamps, maps, backend)  # type: ignore[arg-type]
 
 
@@ -49,7 +50,7 @@ def _run(code: list[float], frame: tuple[int, int], backend: str) -> list[Tensor
     dtype = torch.float32 if backend == "warp" else torch.float64
     inputs, maps = _inputs(*frame)
     live = [t.float().to(dtype).requires_grad_() for t in (*inputs, torch.tensor(code))]
-    out = _apply(live[:-1], live[-1], night.NightMaps(maps.maps.float().to(dtype), maps.camera_m), backend)
+    out = _apply(live[:-1], live[-1], night.NightMaps(maps.maps.float().to(dtype), maps.camera_m, 1.0), backend)
     weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(3)).to(dtype)
     return [out.detach(), *torch.autograd.grad(out, live, weights)]
 
@@ -77,7 +78,7 @@ def test_code_zero_without_lamps_changes_no_bit(backend: str) -> None:
     inputs[-1] = torch.zeros_like(inputs[-1])
     single = [t.float() for t in inputs]
     code = torch.zeros(WEATHER_DIM, requires_grad=True)
-    out = _apply(single, code, night.NightMaps(maps.maps.float(), maps.camera_m), backend)
+    out = _apply(single, code, night.NightMaps(maps.maps.float(), maps.camera_m, 1.0), backend)
     assert torch.equal(out, single[0])
     assert abs(float(torch.autograd.grad(out.sum(), code)[0][Weather.NIGHT])) > 1.0
 
@@ -123,7 +124,7 @@ def test_headlamps_light_what_is_near_ahead_and_below_their_cut() -> None:
     planes[channels.STREET] = 0.1
     blank = torch.zeros_like(inverse)
     code = torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    out = _apply([image, inverse, blank, blank, torch.zeros_like(image)], code, night.NightMaps(planes, 1.6))
+    out = _apply([image, inverse, blank, blank, torch.zeros_like(image)], code, night.NightMaps(planes, 1.6, 1.0))
     near, far, above, aside = out[:, 0].mean(dim=0).tolist()
     assert near > 1.5 * max(far, above, aside)
 
@@ -135,7 +136,7 @@ def test_small_bright_places_above_the_ground_shine_on_and_patches_of_sun_do_not
     rgb[70:, :40] = 1.0
     sky = torch.zeros(96, 96, dtype=torch.float64).numpy()
     sky[:18] = 1.0
-    lit = night._lit_share(rgb, sky)
+    lit = night.find_lit(rgb, sky)
     assert lit[61, 61] == 1.0
     assert lit[21, 21] == 0.0  # next to the sky
     assert not lit[75:, :35].any()  # too large

@@ -65,6 +65,33 @@ def test_a_step_that_fails_is_named() -> None:
         list(install.measure(quick=False, run=Recorder(failing="pip install")))
 
 
+class DetectorRecorder(Recorder):
+    """Leaves the report of an attack too."""
+
+    def __call__(self, words: Sequence[str], folder: Path) -> StepResult:
+        result = super().__call__(words, folder)
+        if "attack" in words and not result.failed:
+            out = Path(words[words.index("--out") + 1])
+            out.mkdir()
+            (out / "report.html").touch()
+        return result
+
+
+def test_paths_of_detectors() -> None:
+    run = DetectorRecorder()
+    hf, bundled = install.measure_paths(["hf:models/detr", "squeezedet"], run)
+    assert (hf.detector, hf.lines, hf.outcome, bundled.detector) == ("hf:detr", 5, "report", "squeezedet")
+    lines = [line for line, _ in run.steps]
+    assert lines[2].endswith("pip install -q -c constraints.txt -e .[transformers]")
+    assert lines[3].endswith("check --detector hf:models/detr")
+    assert lines[7].endswith("-e .")
+    (failed,) = install.measure_paths(["onnx:a.onnx"], DetectorRecorder(failing=" check "))
+    assert failed.outcome == "check: no such thing"
+    assert failed.attack == 0
+    (without,) = install.measure_paths(["onnx:a.onnx"], Recorder())
+    assert without.outcome == "attack: no report"
+
+
 @pytest.mark.slow
 def test_install(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Of this environment: whatever it takes, drivesem's help loads no torch, and comes at once."""

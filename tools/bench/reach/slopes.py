@@ -111,6 +111,8 @@ def _of(space: ParameterSpace, parameter: Parameter, generator: torch.Generator)
         for k, direction in enumerate(ffd.low_order_modes()):
             yield _probe(space, "mesh, low bends", f"bend {k}", where, step * direction)
         return
+    if parameter is Parameter.WEATHER:
+        size = where.stop - where.start  # a budget may leave night out
     for k, direction in enumerate(torch.eye(size)):
         name = spec.names[k]
         yield _probe(space, name if parameter is Parameter.TRANSLATE else row, name, where, step * direction)

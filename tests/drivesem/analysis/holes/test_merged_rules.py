@@ -125,7 +125,7 @@ def test_a_rule_is_not_printed_where_its_intervals_overlap() -> None:
 
 
 def test_every_feature_has_words() -> None:
-    codes = [name for p in ("color", "weather", "foliage", "sun") for name in SPECS[Parameter(p)].names]
+    codes = [name for p in ("color", "weather", "foliage", "sun", "lamps") for name in SPECS[Parameter(p)].names]
     assert {*IMAGE_FEATURES, *POSE_FEATURES, "moved_m", "grown_percent", *codes} == set(FEATURE_TEXT)
     assert describe_rule({"paint.b": (0.344, 0.993), "distance_m": (8.0, 12.5)}) == (
         "paint, -1 bluer to 1 yellower: 0.344 to 0.993; nearer to further: 8 to 12.5 m"

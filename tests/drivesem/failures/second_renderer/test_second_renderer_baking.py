@@ -104,6 +104,6 @@ def test_paint_codes_have_their_effect() -> None:
 
 
 def test_shadows_go_under_a_closed_sky() -> None:
-    clear, closed = np.zeros(4, np.float32), np.array([0, 0, 0, 1], np.float32)
+    clear, closed = np.zeros(5, np.float32), np.array([0, 0, 0, 1, 0], np.float32)
     assert shading.remaining_shade(clear) == 1
     assert shading.remaining_shade(closed) == pytest.approx(0.4)
