@@ -211,9 +211,7 @@ class DelightRun(AveragedRun[DelightNet]):
         with self.timed():
             images, clouded, elevation, sky = build_batch(store, step, settings)
             warm = min(1.0, (step + 1) / 50)
-            with torch.autocast("cpu", torch.bfloat16):
-                logits = self.network(images, elevation)
-            found = CLOSED_SKY_LOG * torch.tanh(logits.float() / 2)
+            found = CLOSED_SKY_LOG * torch.tanh(self.network(images, elevation) / 2)
             loss = compute_loss(found, true_log_ratio(images, clouded), sky, settings.gradient)
             self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
         return float(loss.detach())

@@ -197,7 +197,8 @@ def apply_weather(
     air = air + model.HAZE_GREY * (fog + rain - fog * rain) * ((air * luma).sum() - air)
 
     gain = time_gain(time, low_sun_share(fog, rain, overcast))
-    image = image + gain[:, None, None] * image
+    sky_gain = image.new_tensor(model.TWILIGHT_SKY) * time * time
+    image = image + (gain[:, None, None] + sky * sky_gain[:, None, None]) * image
     air = air + gain * air
 
     # Rain: wet and dark, haze, a sheen on the road that mirrors what is above, streaks.

@@ -188,10 +188,12 @@ COVER_AIR, COVER_LIGHT, COVER_STRUCTURE = 0.55, 0.36, 0.15
 """The cloud cover: share of the grey airlight, light of its own, and remaining structure of the sky."""
 OVERCAST_AIR = 0.9
 """Brightness of the airlight under it, relative to the grey one."""
-DARKENING = (2.0 / 2.2, 1.75 / 2.2, 1.25 / 2.2)
-"""Optical depth of red, green and blue at time code 1, divided by the display's exponent: the end of civil
-twilight, blue and dark, while the road can still be seen without lamps.
+DARKENING = (0.42, 0.36, 0.26)
+"""Optical depth of red, green and blue at time code 1 in display values, after the camera's exposure: the end of civil
+twilight, bluer and somewhat darker, as a dashcam exposes longer.
 """
+TWILIGHT_SKY = (0.45, 0.42, 0.38)
+"""What it adds to the sky's gain: the glow of twilight lights the sky more than the ground."""
 WARMTH = (0.70, 0.12, -0.42)
 """What dusk, at half the time code, adds to red, green and blue."""
 DUSK_ENDS, DIMMING, DIMMING_ENDS = 3.5, 0.25, 2.0

@@ -53,15 +53,17 @@ LEAF_TURN_SLOPE = model.LEAF_TURN_MORE * model.LEAF_TURN_BEND
 LUMA = wp.constant(wp.vec3f(*model.LUMA))
 DARKENING = wp.constant(wp.vec3d(*model.DARKENING))
 WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
+TWILIGHT_SKY = wp.constant(wp.vec3d(*model.TWILIGHT_SKY))
 
 _STRIP = 64
 """Columns that a CPU thread smears at a time; `_mirror_columns` and its adjoint have room for this many."""
 (OVERCAST, WET, MIST, COVER) = range(4)
-(GAIN, GAIN_SLOPE, GAIN_BY_SUN, AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_SUN, AIR_BY_HAZE) = range(4, 28, 3)
-SETTINGS = 28
+(GAIN, GAIN_SLOPE, GAIN_BY_SUN, SKY_GAIN, SKY_GAIN_SLOPE) = range(4, 19, 3)
+(AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_SUN, AIR_BY_HAZE) = range(19, 34, 3)
+SETTINGS = 34
 """First index of each setting, equal for all pixels, and their count: weight of overcast; rain; fog; overcast of a
-black sky; gain of the time of day (3), its slopes along time (3) and the low sun's share (3); airlight (3), its
-slopes along overcast, time and the low sun's share (3 each), and its change by either of fog and rain, fully on alone
+black sky; gain of the time of day (3), its slopes along time (3) and the low sun's share (3); the sky's further gain (3)
+and its slope along time (3); airlight (3), its slopes along overcast, time and the low sun's share (3 each), and its change by either of fog and rain, fully on alone
 (3).
 """
 CODES = 5
@@ -111,6 +113,8 @@ def _settings_kernel(start: int, code: Floats, air: Floats, settings: Floats):
     settings[GAIN + c] = wp.float32(gain)
     settings[GAIN_SLOPE + c] = wp.float32(slope)
     settings[GAIN_BY_SUN + c] = wp.float32(warmth)
+    settings[SKY_GAIN + c] = wp.float32(square * TWILIGHT_SKY[c])
+    settings[SKY_GAIN_SLOPE + c] = wp.float32(two * time * TWILIGHT_SKY[c])
     settings[AIR + c] = wp.float32(misty + gain * misty)
     along = away + greyed * (darker - away)
     settings[AIR_BY_OVERCAST + c] = wp.float32(wp.float64(model.OVERCAST) * along * (one + gain))
@@ -152,7 +156,7 @@ def _damp_change(x: wp.vec3f):
 def _dampen(x: wp.vec3f, sky: wp.float32, settings: Floats):
     """A pixel after overcast, time of day and damp."""
     covered = x + load(settings, OVERCAST) * _overcast_change(x, sky, settings)
-    timed = _apply_gain(covered, load3(settings, GAIN, 1))
+    timed = _apply_gain(covered, load3(settings, GAIN, 1) + sky * load3(settings, SKY_GAIN, 1))
     return timed + (model.DAMP * load(settings, WET)) * _damp_change(timed)
 
 
@@ -263,19 +267,22 @@ def _dampen_adjoint(x: wp.vec3f, sky: wp.float32, g: wp.vec3f, settings: Floats)
     """Gradients of `_dampen` to x; to rain, time, overcast and the low sun's share (4); and to sky."""
     overcast = load(settings, OVERCAST)
     damping = model.DAMP * load(settings, WET)
-    gain = load3(settings, GAIN, 1)
+    sky_gain = load3(settings, SKY_GAIN, 1)
+    gain = load3(settings, GAIN, 1) + sky * sky_gain
     change = _overcast_change(x, sky, settings)
     covered = x + overcast * change
     rain = model.DAMP * wp.dot(g, _damp_change(_apply_gain(covered, gain)))
     wetted = g + damping * ((DAMP * g + DAMP_GREY * sum3(g) * LUMA) - g)
     by_gain = wp.cw_mul(wetted, covered)
-    time = wp.dot(by_gain, load3(settings, GAIN_SLOPE, 1))
+    time = wp.dot(by_gain, load3(settings, GAIN_SLOPE, 1) + sky * load3(settings, SKY_GAIN_SLOPE, 1))
     low_sun = wp.dot(by_gain, load3(settings, GAIN_BY_SUN, 1))
     timed = _apply_gain(wetted, gain)
     flat = (1.0 - sky) * timed
     grey_slope = FLAT_GREY * sum3(flat) + model.COVER_STRUCTURE * sky * sum3(timed)
     out = timed + overcast * ((FLAT * flat + grey_slope * LUMA) - timed)
-    g_sky = overcast * wp.dot(timed, _overcast_change(x, 1.0, settings) - _overcast_change(x, 0.0, settings))
+    g_sky = wp.dot(by_gain, sky_gain) + overcast * wp.dot(
+        timed, _overcast_change(x, 1.0, settings) - _overcast_change(x, 0.0, settings)
+    )
     return out, wp.vec4f(rain, time, model.OVERCAST * wp.dot(timed, change), low_sun), g_sky
 
 
