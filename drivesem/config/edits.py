@@ -40,11 +40,12 @@ FOLIAGE_CODES = ("hue", "lightness", "density")
 SUN_CODES = ("azimuth", "elevation", "strength")
 WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "fog": {"fog": 0.6, "overcast": 0.4},
-    "rain": {"rain": 0.8, "overcast": 0.6},
+    "rain": {"rain": 0.8, "overcast": 1.0},
     "sunset": {"time": 0.5},
     "overcast": {"overcast": 1.0},
     "twilight": {"time": 1.0},
     "night": {"night": 1.0, "overcast": 0.3},
+    "snow": {"snow": 0.8},
 }
 """Weather codes by name; all others are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "lamps", "remove")
