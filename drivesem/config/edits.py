@@ -2,7 +2,7 @@
 
 An edit of one frame, as YAML or as nested mappings:
 
-    weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast, night; or a name, such as sunset
+    weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast, night, snow; or a name, such as sunset
     foliage: {hue: 0.4}             # codes in [-1, 1]: hue, lightness, density
     sun: {azimuth: -0.5}            # codes in [-1, 1]: azimuth, elevation, strength
     objects:
@@ -104,7 +104,7 @@ class FrameEdit:
     objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
     """Changes of vehicles by track (generated streets) or row (scenes), or of "all"."""
     weather: tuple[float, ...] = (0.0,) * len(WEATHER_CODES)
-    """Weather codes (5,), in [0, 1]."""
+    """Weather codes (6,), in [0, 1]."""
     foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_CODES)
     """Foliage codes (3,), in [-1, 1]."""
     sun: tuple[float, ...] = (0.0,) * len(SUN_CODES)
