@@ -30,10 +30,10 @@ from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.meshes.load import load_mesh, save_mesh
 from scene_ir.types import (
-    DAYLIGHT_DIM,
     FOLIAGE_DIM,
     LATTICE_POINTS,
     LIGHT_DIM,
+    PAST_WEATHER_DIMS,
     TEXTURE_DIM,
     WEATHER_DIM,
     Camera,
@@ -198,7 +198,9 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
         lambda: Environment(
             **{
                 name: environment_node[name].tensor(
-                    DAYLIGHT_DIM if name == "weather" and environment_node[name].rows() == DAYLIGHT_DIM else width
+                    environment_node[name].rows()
+                    if name == "weather" and environment_node[name].rows() in PAST_WEATHER_DIMS
+                    else width
                 )
                 for name, width in _ENVIRONMENT_FIELDS.items()
             },

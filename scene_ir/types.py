@@ -36,11 +36,14 @@ class Weather(IntEnum):
     TIME = 2
     OVERCAST = 3
     NIGHT = 4
+    SNOW = 5
 
 
 WEATHER_DIM = len(Weather)
 DAYLIGHT_DIM = int(Weather.NIGHT)
-"""Codes before `NIGHT`: the paper's, and those of scenes saved before there was a night."""
+"""Codes before `NIGHT`: the paper's."""
+PAST_WEATHER_DIMS = (DAYLIGHT_DIM, int(Weather.SNOW))
+"""Codes of scenes saved before there was a night, and before there was snow."""
 
 
 class Part(IntEnum):
@@ -307,7 +310,7 @@ class Environment:
     """Codes and maps of the surroundings."""
 
     weather: Tensor
-    """(5,) in [0, 1], see `Weather`; 0 is as photographed. (4,), the codes of daylight, is night 0."""
+    """(6,) in [0, 1], see `Weather`; 0 is as photographed. With fewer, of `PAST_WEATHER_DIMS`, the rest is 0."""
     foliage: Tensor
     """(3,) in [-1, 1]; 0 is as photographed."""
     sun: Tensor
@@ -327,8 +330,8 @@ class Environment:
     exp((2 code - 1) `render.model.CLOSED_SKY_LOG`); None for what is not known."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.weather, Tensor) and self.weather.shape == (DAYLIGHT_DIM,):
-            weather = torch.nn.functional.pad(self.weather, (0, WEATHER_DIM - DAYLIGHT_DIM))
+        if isinstance(self.weather, Tensor) and self.weather.shape in [(n,) for n in PAST_WEATHER_DIMS]:
+            weather = torch.nn.functional.pad(self.weather, (0, WEATHER_DIM - len(self.weather)))
             object.__setattr__(self, "weather", weather)
         check_shape("environment.weather", self.weather, WEATHER_DIM)
         check_shape("environment.foliage", self.foliage, FOLIAGE_DIM)

@@ -7,7 +7,7 @@ A YAML file names the parameters with tighter limits than the paper's budget:
     rotate: 5deg        # a bare number is in rad
     mesh: 0.1           # unit boxes
     color: 0.5          # codes, like weather and foliage
-    night: 0.5          # the code of night alone, with street; 0 leaves night out
+    night: 0.5          # the code of night alone, with street; 0 leaves night out; snow likewise
 """
 
 from __future__ import annotations
@@ -48,11 +48,13 @@ PRESETS: Mapping[str, Budget] = {
         size=0.1,
         sun=1.0,
         night=1.0,
+        snow=1.0,
         lamps=1.0,
     ),
 }
-_NIGHT = "night"
-_LIMITS = (*(p.value for p in Parameter), _NIGHT)
+_RARE = ("night", "snow")
+"""Codes of weather with limits of their own."""
+_LIMITS = (*(p.value for p in Parameter), *_RARE)
 """Limits that a text can set."""
 _UNITS: Mapping[str, Mapping[str, float]] = {
     Parameter.TRANSLATE: LENGTH_UNITS,
@@ -95,8 +97,9 @@ def resolve_parameters(config: AttackConfig) -> tuple[Parameter, ...]:
 
 
 def budget_for_coordinates(budget: Budget, names: Sequence[str]) -> Budget:
-    """The budget of a recorded theta with these coordinates: runs made before there was a night have none."""
-    return budget if any(name.endswith(f".{_NIGHT}") for name in names) else replace(budget, night=0.0)
+    """The budget of a recorded theta with these coordinates: runs made before there was night or snow have none."""
+    missing = [code for code in _RARE if not any(name.endswith(f".{code}") for name in names)]
+    return replace(budget, **dict.fromkeys(missing, 0.0))
 
 
 def change_limits(budget: Budget, parametrisation: Parametrisation = "ground") -> ChangeLimits:
@@ -146,7 +149,7 @@ def _narrow_budget(where: str, content: Any, preset: Budget = PRESETS[PAPER]) ->
         if widest == 0:
             expected = f"{STREET},{name}={value}, since only {STREET} lets it change"
             raise FormatError(f"{where}: {name}", expected, value)
-        if not (0 < limit <= widest or (name == _NIGHT and limit == 0)):
+        if not (0 < limit <= widest or (name in _RARE and limit == 0)):
             maximum = "" if widest == math.inf else f" of at most {widest:g}"
             raise FormatError(f"{where}: {name}", f"a positive number{maximum}", value)
         limits[key] = limit

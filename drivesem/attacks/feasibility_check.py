@@ -61,13 +61,13 @@ MINIMUM_PX = 8.0
 MINIMUM_TOLERANCE_PX = 1.0
 WEATHER_TOLERANCE = 0.01
 """Tolerance of weather codes and their limits."""
-_NIGHT = 4
-"""Index of night's code."""
+_NIGHT, _SNOW = 4, 5
+"""Indices of the codes of night and snow."""
 RAIN_UNDER_CLEAR_SKY = 0.5
 """Maximum code of rain under a sky as bright as photographed: a shower."""
 DAYLIGHT_LX, TWILIGHT_LX = 15_000.0, 3.4
 """Illuminance in the shade at noon, and at the end of civil twilight (RCA Electro-Optics Handbook, 1974)."""
-EXTINCTION_PER_M = (0.03, 0.006)
+EXTINCTION_PER_M = (0.03, 0.006, 0.0075)
 """Extinction of the codes fog 1 and rain 1."""
 DIMMING = 0.8
 """Exponent of the dimming of display values at time 1."""
@@ -112,6 +112,8 @@ class ChangeLimits:
     """Code, absolute."""
     night: float = 0.0
     """Code of night."""
+    snow: float = 0.0
+    """Code of snow."""
     lamps: float = 0.0
     """Code, absolute."""
     roi: bool = False
@@ -349,11 +351,12 @@ def _code_violations(base: SceneIR, perturbed: SceneIR, limits: ChangeLimits) ->
         "objects.lamps": (old.lamps, new.lamps, -limits.lamps, limits.lamps),
         "environment.weather": (before.weather[:_NIGHT], after.weather[:_NIGHT], 0.0, limits.weather),
         "environment.night": (
-            before.weather[_NIGHT:],
-            after.weather[_NIGHT:],
+            before.weather[_NIGHT:_SNOW],
+            after.weather[_NIGHT:_SNOW],
             0.0,
             min(limits.weather, limits.night),
         ),
+        "environment.snow": (before.weather[_SNOW:], after.weather[_SNOW:], 0.0, min(limits.weather, limits.snow)),
         "environment.foliage": (before.foliage, after.foliage, -limits.foliage, limits.foliage),
         "environment.light": (before.light, after.light, -limits.sun, limits.sun),
     }
@@ -369,8 +372,10 @@ def _weather_violations(base: SceneIR, perturbed: SceneIR) -> list[str]:
     """Combinations of weather codes that hardly ever occur, beyond those in `base`."""
     before, after = (_Sky(*scene.environment.weather.tolist()) for scene in (base, perturbed))
     violations = []
-    if after.fog + after.rain > max(1.0, before.fog + before.rain) + WEATHER_TOLERANCE:
-        violations.append(f"weather: fog {after.fog:.2f} is washed out by rain {after.rain:.2f}")
+    if after.drops > max(1.0, before.drops) + WEATHER_TOLERANCE:
+        violations.append(
+            f"weather: fog {after.fog:.2f} is washed out by rain {after.rain:.2f} and snow {after.snow:.2f}"
+        )
     if after.rain - after.overcast > max(RAIN_UNDER_CLEAR_SKY, before.rain - before.overcast) + WEATHER_TOLERANCE:
         violations.append(f"weather: rain {after.rain:.2f} out of a sky covered {after.overcast:.2f}")
     if after.light_lx < min(TWILIGHT_LX, before.light_lx) * (1 - 5 * WEATHER_TOLERANCE):
@@ -389,18 +394,25 @@ class _Sky:
     time: float
     overcast: float
     night: float
+    snow: float
+
+    @property
+    def drops(self) -> float:
+        """Water in the air, as shares of what it holds of one kind."""
+        return self.fog + self.rain + self.snow
 
     @property
     def light_lx(self) -> float:
-        """Daylight on the road, before night. Overcast, fog and rain each take nine tenths."""
+        """Daylight on the road, before night. Overcast, fog, rain and snow each take nine tenths."""
         dusk = (TWILIGHT_LX / DAYLIGHT_LX) ** self.time
-        return DAYLIGHT_LX * dusk * 0.1 ** (self.fog + self.rain + self.overcast)
+        return DAYLIGHT_LX * dusk * 0.1 ** (self.drops + self.overcast)
 
     def dimmed(self, tones: Array, air: float, away_m: float) -> Array:
         """Display values as they appear at a distance, where the air has the display value `air`. Night hides no car:
         its lamps are lit.
         """
-        clear = math.exp(-away_m * (EXTINCTION_PER_M[0] * self.fog + EXTINCTION_PER_M[1] * self.rain))
+        codes = (self.fog, self.rain, self.snow)
+        clear = math.exp(-away_m * sum(rate * code for rate, code in zip(EXTINCTION_PER_M, codes, strict=True)))
         return (clear * tones + (1 - clear) * air) * math.exp(-DIMMING * self.time**2)
 
 

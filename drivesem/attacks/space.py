@@ -145,14 +145,18 @@ _HALF_LATTICE = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
 _WEATHER_NAMES = tuple(
     f"weather.{'time_of_day' if code is Weather.TIME else code.name.lower()}" for code in Weather
 )
-_DAYLIGHT = ParameterSpec(DAYLIGHT_DIM, False, "code", _WEATHER_NAMES[:DAYLIGHT_DIM])
-"""Weather where the budget has no night: the paper's four codes."""
+
+
+def _weather_spec(size: int) -> ParameterSpec:
+    """The first `size` codes of `Weather`."""
+    return ParameterSpec(size, False, "code", _WEATHER_NAMES[:size])
+
 
 SPECS: dict[Parameter, ParameterSpec] = {
     Parameter.COLOR: ParameterSpec(
         TEXTURE_DIM, True, "code", tuple(f"paint.{n}" for n in ("lightness", "a", "b", "gloss", "dirt"))
     ),
-    Parameter.WEATHER: ParameterSpec(WEATHER_DIM, False, "code", _WEATHER_NAMES),
+    Parameter.WEATHER: _weather_spec(WEATHER_DIM),
     Parameter.FOLIAGE: ParameterSpec(
         FOLIAGE_DIM, False, "code", tuple(f"foliage.{n}" for n in ("hue", "lightness", "density"))
     ),
@@ -209,7 +213,9 @@ class Budget:
     sun: float = 0.0
     """Code, absolute; 0 fixes it."""
     night: float = 0.0
-    """Code of night, as far as `weather` allows it too; 0 leaves it out of theta."""
+    """Code of night, as far as `weather` allows it too; 0 fixes it."""
+    snow: float = 0.0
+    """Code of snow, likewise."""
     lamps: float = 0.0
     """Code, absolute; 0 fixes it."""
     translate_m: float = math.inf
@@ -223,7 +229,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         unbounded = ("translate_m", "across_m", "distance_share", "partly_visible")
-        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun", "night", "lamps"))
+        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun", "night", "snow", "lamps"))
 
     def check(self, params: Iterable[Parameter], parametrisation: Parametrisation = "ground") -> None:
         """Raise FormatError for a parameter that this budget fixes, or for a budget in metres with `roi`."""
@@ -283,7 +289,7 @@ class Perturbation:
     color: Tensor | None = None
     """(N, 5), codes."""
     weather: Tensor | None = None
-    """(5,), codes; (4,) where the budget has no night."""
+    """(6,), codes; without snow in the budget (5,), and without night either the paper's (4,)."""
     foliage: Tensor | None = None
     """(3,), codes."""
     translate: Tensor | None = None
@@ -359,7 +365,8 @@ class ParameterSpace(ThetaSpace[Parameter]):
         """
         self.budget = budget or Budget()
         specs = SPECS | {Parameter.TRANSLATE: _ROI_TRANSLATE} if parametrisation == "roi" else SPECS
-        specs = specs if self.budget.night else specs | {Parameter.WEATHER: _DAYLIGHT}
+        past = Weather.SNOW if self.budget.night else DAYLIGHT_DIM
+        specs = specs if self.budget.snow else specs | {Parameter.WEATHER: _weather_spec(past)}
         super().__init__(
             select_parameters(Parameter, params), specs, len(scene.objects), scene.objects.translation
         )
@@ -444,8 +451,9 @@ class ParameterSpace(ThetaSpace[Parameter]):
         return scene.with_environment(**codes) if codes else scene
 
     def _weather_limits(self, codes: Tensor) -> Tensor:
-        """Upper bounds of weather codes (4,) or (5,)."""
-        limits = [self.budget.weather] * DAYLIGHT_DIM + [min(self.budget.weather, self.budget.night)]
+        """Upper bounds of weather codes (4,), (5,) or (6,)."""
+        weather, rare = self.budget.weather, (self.budget.night, self.budget.snow)
+        limits = [weather] * DAYLIGHT_DIM + [min(weather, limit) for limit in rare]
         return codes.new_tensor(limits)[: len(codes)]
 
     def _shift_m(self, scene: SceneIR, translate: Tensor) -> Tensor:

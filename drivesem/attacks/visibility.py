@@ -148,7 +148,7 @@ class VisibilityUnderWeather:
 
     @torch.no_grad()
     def __call__(self, weather: Array) -> Flags:
-        """Which objects (N,) become invisible under weather codes (5,); night hides none, since lamps are lit."""
+        """Which objects (N,) become invisible under weather codes (6,); night hides none, since lamps are lit."""
         invisible = np.zeros_like(self._visible)
         if self._visible.any():
             contrasts = self._contrasts(torch.from_numpy(weather).to(self._image))

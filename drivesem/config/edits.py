@@ -2,7 +2,7 @@
 
 An edit of one frame, as YAML or as nested mappings:
 
-    weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast, night; or a name, such as sunset
+    weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast, night, snow; or a name, such as sunset
     foliage: {hue: 0.4}             # codes in [-1, 1]: hue, lightness, density
     sun: {azimuth: -0.5}            # codes in [-1, 1]: azimuth, elevation, strength
     objects:
@@ -40,11 +40,12 @@ FOLIAGE_CODES = ("hue", "lightness", "density")
 SUN_CODES = ("azimuth", "elevation", "strength")
 WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "fog": {"fog": 0.6, "overcast": 0.4},
-    "rain": {"rain": 0.8, "overcast": 0.6},
+    "rain": {"rain": 0.8, "overcast": 1.0},
     "sunset": {"time": 0.5},
     "overcast": {"overcast": 1.0},
     "twilight": {"time": 1.0},
     "night": {"night": 1.0, "overcast": 0.3},
+    "snow": {"snow": 0.8},
 }
 """Weather codes by name; all others are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "lamps", "remove")
@@ -103,7 +104,7 @@ class FrameEdit:
     objects: Mapping[int | str, ObjectEdit] = field(default_factory=dict)
     """Changes of vehicles by track (generated streets) or row (scenes), or of "all"."""
     weather: tuple[float, ...] = (0.0,) * len(WEATHER_CODES)
-    """Weather codes (5,), in [0, 1]."""
+    """Weather codes (6,), in [0, 1]."""
     foliage: tuple[float, ...] = (0.0,) * len(FOLIAGE_CODES)
     """Foliage codes (3,), in [-1, 1]."""
     sun: tuple[float, ...] = (0.0,) * len(SUN_CODES)

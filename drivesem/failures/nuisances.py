@@ -137,7 +137,7 @@ class Nuisances:
             angle=math.radians(self.angle_deg) * angle,
             size=self.size * size,
             paint=self.code * paint,
-            weather=self.code * torch.cat([daylight, night]),
+            weather=self.code * torch.cat([daylight, night, torch.zeros(1)]),
             foliage=self.code * foliage,
         )
 

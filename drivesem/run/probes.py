@@ -137,7 +137,7 @@ def gradient(
     config.check()
     config = replace(config, objective=cast("Any", objective))
     ir = convert_scene(scene.ir, None, detector_device(loaded))
-    photographed, budget = ir.unperturbed(), Budget(size=1.0, sun=1.0, night=1.0, lamps=1.0)
+    photographed, budget = ir.unperturbed(), Budget(size=1.0, sun=1.0, night=1.0, snow=1.0, lamps=1.0)
     changes = Perturbation.between(photographed, ir)
     # parameters without a derivative keep their values
     fixed, theta0 = _space_and_theta(photographed, changes, [p for p in Parameter if p not in parameters], budget)

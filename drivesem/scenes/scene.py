@@ -84,14 +84,15 @@ class Scene:
 
     @property
     def weather(self) -> dict[str, float]:
-        """The weather codes: fog, rain, time, overcast, night; in [0, 1]."""
+        """The weather codes: fog, rain, time, overcast, night, snow; in [0, 1]."""
         return dict(zip(WEATHER_CODES, self.ir.environment.weather.tolist(), strict=True))
 
     @property
     def theta(self) -> dict[str, float]:
         """All changes from the photograph, by name, such as objects[3].yaw; empty where nothing is changed."""
         photographed = self.ir.unperturbed()
-        space = ParameterSpace(photographed, tuple(Parameter), Budget(size=1.0, sun=1.0, night=1.0, lamps=1.0))
+        budget = Budget(size=1.0, sun=1.0, night=1.0, snow=1.0, lamps=1.0)
+        space = ParameterSpace(photographed, tuple(Parameter), budget)
         theta = space.flatten(Perturbation.between(photographed, self.ir)).tolist()
         return {space.name(i): value for i, value in enumerate(theta) if abs(value) > _NO_CHANGE}
 
@@ -126,7 +127,7 @@ class Scene:
 
         Args:
             settings: Changes in the syntax of `drivesem edit --set`.
-            weather: A name (fog, rain, sunset, overcast, twilight, night), amounts ("fog=0.6,night=1") or codes.
+            weather: A name (fog, rain, sunset, overcast, twilight, night, snow), amounts ("fog=0.6,night=1") or codes.
             foliage: Codes.
             objects: Changes by row.
             remove: Rows to remove.

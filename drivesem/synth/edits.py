@@ -124,9 +124,11 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
     """Light under a weather code: physical counterparts of what the compositor does to the picture."""
     if not any(code):
         return light
-    fog, rain, _, overcast, night = code
+    fog, rain, _, overcast, night, snow = code
     if night:
         raise RangeError("weather.night", "0, since generated streets are drawn by daylight", night)
+    if snow:
+        raise RangeError("weather.snow", "0, since no snow falls in generated streets", snow)
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
     codes = torch.tensor(code, dtype=torch.float64)

@@ -191,6 +191,7 @@ def _widen_budget(budget: Budget, found: Perturbation) -> Budget:
             wider[parameter.value] = most
     if found.weather is not None:
         wider["night"] = max(budget.night, float(found.weather[Weather.NIGHT]))
+        wider["snow"] = max(budget.snow, float(found.weather[Weather.SNOW]))
     return replace(budget, **wider)
 
 

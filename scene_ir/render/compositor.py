@@ -16,9 +16,10 @@ from torch import Tensor
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
 from scene_ir.render import blend, fast, reference
-from scene_ir.render.channels import LIT
+from scene_ir.render.channels import LIT, RISE
 from scene_ir.render.environment import (
     PerturbedSun,
+    add_flakes,
     apply_foliage,
     apply_weather,
     shadow_softening,
@@ -27,8 +28,9 @@ from scene_ir.render.environment import (
 from scene_ir.render.lamps import draw_lamps
 from scene_ir.render.night import apply_night
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
+from scene_ir.render.reflections import mirror_in_ground
 from scene_ir.render.texture import PaintRegions
-from scene_ir.types import Crop, Objects, Render, SceneIR
+from scene_ir.types import Crop, Objects, Render, SceneIR, Weather
 
 
 def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) -> list[Render]:
@@ -146,7 +148,14 @@ class Compositor(PreparedScene):
         if weather:
             changed = replace(behind, weather=environment.weather.to(self.like))
             colour, inverse = canvas.split([3, 1])
-            image = apply_weather(colour, inverse[0], changed, self.air, backend)
+            mirrored = None
+            if is_active(changed.weather[Weather.RAIN]):
+                values = torch.cat([colour, changed.sky.to(colour)[None]])
+                rise, camera_m = self.night_maps.maps[RISE], self.night_maps.camera_m
+                mirrored = mirror_in_ground(values, inverse[0], changed.road, rise, camera_m)
+            image = apply_weather(colour, inverse[0], changed, self.air, mirrored, backend)
+            if is_active(changed.weather[Weather.SNOW]):
+                image = add_flakes(image, inverse[0], changed, self.air)
             lit = self.night_maps.maps[LIT]
             lit = lit if shows is None else lit * shows
             lamps = torch.zeros_like(colour)

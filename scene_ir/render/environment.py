@@ -6,6 +6,7 @@ there from both sides, although weather codes are bounded to [0, 1].
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,7 +20,7 @@ from scene_ir.geometry import clamp_inclusive, height_above_ground
 from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
-from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab, smoothstep
+from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab
 from scene_ir.types import DAYLIGHT_DIM, Environment, SceneIR, Weather
 
 
@@ -157,10 +158,15 @@ def _leaves(rgb: Tensor, code: Tensor, maps: Tensor) -> Tensor:
 
 
 def apply_weather(
-    image: Tensor, inverse_depth: Tensor, environment: Environment, air: Tensor, backend: Backend = "reference"
+    image: Tensor,
+    inverse_depth: Tensor,
+    environment: Environment,
+    air: Tensor,
+    mirrored: Tensor | None = None,
+    backend: Backend = "reference",
 ) -> Tensor:
-    """The picture (3, H, W) under `environment.weather`: fog, rain, time of day, overcast, each in [0, 1]; night is
-    `night.apply_night`.
+    """The picture (3, H, W) under `environment.weather`: fog, rain, time of day, overcast, and the haze, clouds and
+    slush of snow. Its flakes are `add_flakes`, night is `night.apply_night`.
 
     Differentiable to all, including the maps of sky and road; with backend `warp` (float32, fused) to all but the
     airlight, and to the road only where there is some.
@@ -168,54 +174,109 @@ def apply_weather(
     Args:
         image: (3, H, W).
         inverse_depth: (H, W) 1/m, 0 in the sky.
-        environment: Weather code, maps of sky and road.
+        environment: Weather code, maps of sky and road, ground.
         air: (3,) RGB of the airlight.
+        mirrored: (4, H, W), picture and sky as of `reflections.mirror_in_ground`; None where no road is wet.
         backend: Implementation.
     """
+    weather, snow = _daylight_codes(environment.weather.to(image)), environment.weather[Weather.SNOW].to(image)
+    if snow.requires_grad or bool(snow.detach() != 0):
+        image = image + (model.SLUSH * snow) * environment.road.to(image) * (model.SLUSH_LIGHT - image)
+    streaks = _rain_streaks(*environment.sky.shape).to(image)
+    inputs = (image, inverse_depth, weather, air, environment, mirrored, streaks)
     if backend == "warp":
-        streaks = _rain_streaks(*environment.sky.shape).to(image)
         from scene_ir.render.kernels import effects
 
-        fog, rain, _, overcast = environment.weather.to(image)[:DAYLIGHT_DIM]
-        low_sun = low_sun_share(fog, rain, overcast)
-        return effects.apply_weather(image, inverse_depth, environment, air, low_sun, streaks)
-    fog, rain, time, overcast = environment.weather.to(image)[:DAYLIGHT_DIM]
-    sky, road = environment.sky.to(image), environment.road.to(image)
+        return effects.apply_weather(*inputs)
+    return _apply_daylight(*inputs)
+
+
+def add_flakes(image: Tensor, inverse_depth: Tensor, environment: Environment, air: Tensor) -> Tensor:
+    """The picture (3, H, W) with the flakes of `environment.weather`'s snow in front of what is farther away;
+    differentiable to all. Other arguments as of `apply_weather`.
+    """
     depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
+    layers = _flakes(*inverse_depth.shape).to(image)
+    nearest = image.new_tensor(model.FLAKE_M)[:, None, None]
+    opacity = ((depth / nearest - 1.0).clamp(0.0, 1.0) * layers).sum(dim=0)
+    weather = environment.weather.to(image)
+    lit = model.FLAKE_LIGHT * _weathered_air(air, _daylight_codes(weather))[:, None, None]
+    return image + (weather[Weather.SNOW] * opacity.clamp(max=1.0)) * (lit - image)
+
+
+def _daylight_codes(weather: Tensor) -> Tensor:
+    """Fog, rain, time, overcast and the low sun's share (5,), with the haze and the clouds of snow; weather: (6,)."""
+    fog, rain, time, overcast = weather[:DAYLIGHT_DIM]
+    snow = weather[Weather.SNOW]
+    fog = fog + model.SNOW_FOG * snow * (1.0 - fog)
+    overcast = overcast + model.SNOW_COVER * snow * (1.0 - overcast)
+    return torch.stack([fog, rain, time, overcast, low_sun_share(fog, rain, overcast)])
+
+
+def _weathered_air(air: Tensor, weather: Tensor) -> Tensor:
+    """The airlight (3,) under codes (5,) of `_daylight_codes`."""
+    fog, rain, time, overcast, low_sun = weather
+    luma = air.new_tensor(model.LUMA)
+    grey = (air * luma).sum()
+    air = air + model.OVERCAST * overcast * (model.OVERCAST_AIR * grey - air)
+    air = air + model.HAZE_GREY * (fog + rain - fog * rain) * ((air * luma).sum() - air)
+    return air + time_gain(time, low_sun) * air
+
+
+def _apply_daylight(
+    image: Tensor,
+    inverse_depth: Tensor,
+    weather: Tensor,
+    air: Tensor,
+    environment: Environment,
+    mirrored: Tensor | None,
+    streaks: Tensor,
+) -> Tensor:
+    """Fog, rain, time of day and overcast.
+
+    Args:
+        image, inverse_depth, air, mirrored: As of `apply_weather`.
+        weather: (5,) of `_daylight_codes`.
+        environment: Maps of sky and road, ground.
+        streaks: (H, W) of `_rain_streaks`.
+    """
+    fog, rain, _, _, _ = weather
+    depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
+    image = _dampen(image, environment.sky.to(image), weather, air)
+    mist = _weathered_air(air, weather)[:, None, None]
+    if mirrored is not None:
+        # A wet road is darker, and mirrors what stands above it, the more the flatter it is seen (Schlick 1994).
+        camera_m = environment.ground[3].to(image)
+        cos = camera_m / (camera_m * camera_m + depth * depth).sqrt()
+        share = model.FILM * (model.WATER + (1.0 - model.WATER) * (1.0 - cos) ** 5)
+        mirror = _dampen(mirrored[:3], mirrored[3], weather, air)
+        sheen = model.SHEEN_MIRROR * mirror + model.SHEEN_AIR * mist - model.WET_ROAD * image
+        wet = rain * environment.road.to(image)
+        image = image + wet * ((model.WET_ROAD - 1.0) * image + share * sheen)
+    veil = -torch.expm1(-model.RAIN_EXTINCTION_PER_M * rain * depth)
+    image = apply_veil(image, veil, model.RAIN_AIR * mist)
+    image = image + model.STREAKS * rain * streaks * (mist - image)
+    # Fog (Koschmieder 1924).
+    return apply_veil(image, -torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth), mist)
+
+
+def _dampen(image: Tensor, sky: Tensor, weather: Tensor, air: Tensor) -> Tensor:
+    """The picture (3, H, W) with share of sky (H, W) under a closed cover, by time of day, and wet."""
+    _, rain, time, overcast, low_sun = weather
     luma = image.new_tensor(model.LUMA)
     grey_air = (air * luma).sum().expand(3)
-
     # Overcast: less colour, less contrast, a plain sky.
     grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
     flat = model.OVERCAST_COLOUR * image + (1.0 - model.OVERCAST_COLOUR) * grey
     flat = model.OVERCAST_TO + model.OVERCAST_CONTRAST * (flat - model.OVERCAST_FROM)
     cover = (model.COVER_AIR * grey_air + model.COVER_LIGHT)[:, None, None]
     cover = cover + model.COVER_STRUCTURE * (grey - grey_air.mean())
-    target = flat + sky * (cover - flat)
-    image = image + model.OVERCAST * overcast * (target - image)
-    air = air + model.OVERCAST * overcast * (model.OVERCAST_AIR * grey_air - air)
-    air = air + model.HAZE_GREY * (fog + rain - fog * rain) * ((air * luma).sum() - air)
-
-    gain = time_gain(time, low_sun_share(fog, rain, overcast))
+    image = image + model.OVERCAST * overcast * (flat + sky * (cover - flat) - image)
     sky_gain = image.new_tensor(model.TWILIGHT_SKY) * time * time
-    image = image + (gain[:, None, None] + sky * sky_gain[:, None, None]) * image
-    air = air + gain * air
-
-    # Rain: wet and dark, haze, a sheen on the road that mirrors what is above, streaks.
+    image = image + (time_gain(time, low_sun)[:, None, None] + sky * sky_gain[:, None, None]) * image
     grey = (image * luma[:, None, None]).sum(dim=0, keepdim=True)
     damp = model.DAMP_LIGHT * (model.DAMP_COLOUR * image + (1.0 - model.DAMP_COLOUR) * grey)
-    image = image + model.DAMP * rain * (damp - image)
-    mirrored = _mirror_road(image)
-    grazing = model.SHEEN_NEAR + model.SHEEN_FAR * smoothstep(depth, *model.SHEEN_M)
-    sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air[:, None, None]
-    image = image + rain * (road * grazing) * (sheen - image)
-    veil = -torch.expm1(-model.RAIN_EXTINCTION_PER_M * rain * depth)
-    image = apply_veil(image, veil, model.RAIN_AIR * air[:, None, None])
-    streaks = _rain_streaks(*sky.shape).to(image)
-    image = image + model.STREAKS * rain * streaks * (air[:, None, None] - image)
-
-    # Fog (Koschmieder 1924).
-    return apply_veil(image, -torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth), air[:, None, None])
+    return image + model.DAMP * rain * (damp - image)
 
 
 def apply_veil(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
@@ -233,14 +294,6 @@ def apply_veil(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
     return image + (torch.sqrt(light + veil * (air * air - image * image)) - torch.sqrt(light))
 
 
-def _mirror_road(image: Tensor) -> Tensor:
-    """Coarse reflection of a wet road: the picture smeared downwards."""
-    height, reach = image.shape[1], model.mirror_reach(image.shape[1])
-    smeared = kornia.filters.box_blur(image[None], (reach, 3), border_type="replicate", separable=True)[0]
-    shift = reach // 2
-    return torch.cat([smeared[:, :1].expand(-1, shift, -1), smeared[:, : height - shift]], dim=1)
-
-
 @lru_cache(maxsize=8)
 def _rain_streaks(height: int, width: int) -> Tensor:
     """Rain streaks (H, W) in [0, 1]: sparse drops drawn out along a slight slant; constant per frame size."""
@@ -253,6 +306,37 @@ def _rain_streaks(height: int, width: int) -> Tensor:
     padded = torch.nn.functional.pad(drops[None, None], (length // 2, (length - 1) // 2) * 2)
     streaks = torch.nn.functional.conv2d(padded, kernel[None, None])
     return kornia.filters.gaussian_blur2d(streaks, (3, 3), (0.6, 0.6))[0, 0].clamp(0.0, 1.0)
+
+
+@lru_cache(maxsize=8)
+def _flakes(height: int, width: int) -> Tensor:
+    """Opacity (L, H, W) in [0, 1] of falling flakes, in layers that begin at `model.FLAKE_M`; constant per frame size.
+
+    Each is a Gaussian, drawn out by its fall and away from the point that the camera drives towards.
+    """
+    rng, counts = np.random.default_rng(19310115), np.rint(np.array(model.FLAKES) * height / width).astype(int)
+    layers = np.zeros((len(model.FLAKE_M), height, width))
+    for layer, near_m, count in zip(layers, model.FLAKE_M, counts, strict=True):
+        px_per_m = model.FLAKE_FOCAL * width / rng.uniform(near_m, 3.0 * near_m, count)
+        x, y = rng.uniform(0, width, count), rng.uniform(0, height, count)
+        sharp = model.FLAKE_RADIUS_M * rng.uniform(0.5, 1.5, count) * px_per_m
+        radius = np.hypot(np.hypot(sharp, model.FLAKE_BLUR_M * px_per_m), model.FLAKE_LEAST_PX)
+        drive = model.FLAKE_DRIVE_M / (model.FLAKE_FOCAL * width) * px_per_m
+        along = np.stack(
+            [drive * (x - width / 2), drive * (y - height / 2) + model.FLAKE_FALL_M * px_per_m], axis=1
+        )
+        length = np.linalg.norm(along, axis=1)
+        opacity = np.minimum(model.FLAKE_OPACITY * sharp**2 / (radius * (radius + length)), 1.0)
+        for i in range(count):
+            reach = math.ceil(3 * radius[i] + length[i] / 2)
+            rows = np.arange(max(0, int(y[i]) - reach), min(height, int(y[i]) + reach + 1))[:, None]
+            columns = np.arange(max(0, int(x[i]) - reach), min(width, int(x[i]) + reach + 1))
+            dx, dy = columns - x[i], rows - y[i]
+            ux, uy = along[i] / max(length[i], 1e-6)
+            beyond = np.maximum(np.abs(dx * ux + dy * uy) - length[i] / 2, 0.0)
+            square = np.square(beyond) + np.square(dx * uy - dy * ux)
+            layer[rows, columns] += opacity[i] * np.exp(-0.5 * square / radius[i] ** 2)
+    return torch.from_numpy(layers).clamp(0.0, 1.0)
 
 
 @lru_cache(maxsize=8)

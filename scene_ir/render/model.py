@@ -169,8 +169,8 @@ LUMA = (0.299, 0.587, 0.114)
 """ITU-R BT.601."""
 SKY_RGB = (0.78, 0.82, 0.87)
 """Colour of the air where the photograph shows no sky."""
-SHADOW_SOFTENING = (0.5, 0.4, 0.5, 0.6, 2.0)
-"""Rates at which fog, rain, time, overcast and night weaken cast shadows."""
+SHADOW_SOFTENING = (0.5, 0.4, 0.5, 0.6, 2.0, 0.6)
+"""Rates at which fog, rain, time, overcast, night and snow weaken cast shadows."""
 CLOSED_SKY_LOG = 1.5
 """Bound of the logarithm of what a closed sky changes: no pixel becomes more than 4.5 times as bright, or as dark."""
 CLOSED_SKY_OFFSET = 0.02
@@ -203,16 +203,36 @@ DAMP = 0.9
 """Weight of the wet picture at rain 1."""
 DAMP_LIGHT, DAMP_COLOUR = 1.0, 0.75
 """Remaining light and colour in it."""
-SHEEN_NEAR, SHEEN_FAR, SHEEN_M = 0.10, 0.30, (4.0, 45.0)
-"""Sheen of a wet road near the camera, gain far away, and the distances between which it grows."""
-SHEEN_MIRROR, SHEEN_AIR = 0.55, 0.40
-"""Parts of the sheen: mirrored picture and airlight."""
+WET_ROAD = 0.60
+"""Remaining light of a wet road's own colour."""
+WATER, FILM = 0.04, 0.9
+"""Share of light that water mirrors at normal incidence (Schlick's approximation), and how far a wet road is covered
+by water.
+"""
+SHEEN_MIRROR, SHEEN_AIR = 0.85, 0.15
+"""Parts of what a wet road mirrors: the smeared picture, and light from all around."""
+MIRROR_ROWS, MIRROR_REACH, MIRROR_SLACK = 180, 0.05, 0.05
+"""Rows of the mirrored picture; share of them over which the road smears it, twice; slack of the search for what a ray
+meets, relative to its slope.
+"""
 RAIN_EXTINCTION_PER_M = 0.006
 """Haze of strong rain at rain code 1."""
 RAIN_AIR = 0.8
 """Brightness of that haze, relative to the airlight."""
-STREAKS = 0.11
+STREAKS = 0.06
 """Opacity of the streaks of rain 1."""
+SNOW_FOG, SNOW_COVER = 0.25, 1.0
+"""Haze and clouds of snow 1, as codes of fog and overcast."""
+SLUSH, SLUSH_LIGHT = 0.18, 0.80
+"""How far the road of snow 1 turns towards a brightness."""
+FLAKE_M, FLAKES = (1.2, 3.6, 10.8), (240, 5000, 20000)
+"""Distances from which, to three times of which, layers of flakes fall, and the flakes of each in a square picture."""
+FLAKE_RADIUS_M, FLAKE_BLUR_M, FLAKE_LEAST_PX = 0.003, 0.002, 0.5
+"""Radius of a flake, its blur out of focus, and the least radius in the picture; standard deviations."""
+FLAKE_OPACITY, FLAKE_LIGHT = 3.0, 1.05
+"""Opacity of flakes before they are drawn out, and their light relative to the airlight's."""
+FLAKE_DRIVE_M, FLAKE_FALL_M, FLAKE_FOCAL = 0.06, 0.012, 0.7
+"""Way of the camera and of flakes during the exposure; focal length, in widths of the picture."""
 FOG_EXTINCTION_PER_M = 0.03
 """Extinction at fog code 1: a meteorological visibility of about 130 m (Koschmieder: 3.9 / extinction)."""
 HAZE_GREY = 0.8
@@ -279,8 +299,8 @@ NIGHT_BEND = 0.02
 
 # --------------------------------------------------------------------------------------------------------- lamps
 
-LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0)
-"""Rates at which fog, rain, time, overcast and night make drivers switch on their lamps."""
+LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0, 1.2)
+"""Rates at which fog, rain, time, overcast, night and snow make drivers switch on their lamps."""
 TAIL_LAMP_RGB, HEADLAMP_RGB = (2.4, 0.10, 0.06), (8.0, 7.2, 6.0)
 """Light of a lamp that faces the camera by night; white is 1."""
 TAIL_CORE = 0.12
@@ -307,8 +327,3 @@ TAIL_LAMP_RED, HEADLAMP_WHITE = (0.12, 0.25), (0.70, 0.85)
 """Excess of red, and least channel, from which a pixel may be, and is, a tail lamp or a headlamp."""
 DRIVEN_ROAD = (0.35, 0.75)
 """Share of road beyond a vehicle's outer side from which it may drive, and does."""
-
-
-def mirror_reach(height: int) -> int:
-    """Odd number of rows over which a wet road smears what it mirrors, in a picture of `height` rows."""
-    return max(3, (height // 12) | 1)

@@ -66,6 +66,7 @@ FEATURE_TEXT = {
     "weather.rain": "rain, 0 none to 1 strong: {}",
     "weather.time_of_day": "time, 0 as photographed to 1 twilight: {}",
     "weather.overcast": "sky, 0 as photographed to 1 overcast: {}",
+    "weather.snow": "snow, 0 none to 1 dense: {}",
     "weather.night": "night, 0 as photographed to 1 street lamps only: {}",
     "lamps": "lamps, -1 off, 0 as the weather has them, 1 braking: {}",
     "foliage.hue": "leaves, hue from -1 to 1: {}",

@@ -417,7 +417,7 @@ def _jacobian_and_height(jacobian: Tensor, height: Tensor) -> Array:
 
 
 FindInvisible = Callable[[Array], Flags]
-"""Which objects (N,) are no longer visible under weather codes (5,)."""
+"""Which objects (N,) are no longer visible under weather codes (6,)."""
 
 _DUSK = math.log10(15_000 / 3.4)
 """Decades of illuminance (lx) from daylight (10,000 to 20,000 without direct sun) to the end of civil twilight,
@@ -433,18 +433,19 @@ strong rain needs deep, wide clouds (WMO, International Cloud Atlas: nimbostratu
 CODE_SUMS = np.array(
     [
         # Drops of rain wash those of fog out of the air, the faster the stronger it rains; fog in rain forms where
-        # weak rain evaporates into cold air (AMS Glossary of Meteorology: washout, precipitation fog).
-        [1.0, 1.0, 0.0, 0.0, 0.0],
-        [0.0, 1.0, 0.0, -1.0, 0.0],
-        [_COVER / _DUSK, _STORM / _DUSK, 1.0, _COVER / _DUSK, 0.0],
+        # weak rain evaporates into cold air (AMS Glossary of Meteorology: washout, precipitation fog). Snow gathers
+        # them likewise, and is snow or rain by the temperature.
+        [1.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        [0.0, 1.0, 0.0, -1.0, 0.0, 0.0],
+        [_COVER / _DUSK, _STORM / _DUSK, 1.0, _COVER / _DUSK, 0.0, _COVER / _DUSK],
         # The glow of dusk ends as night falls.
-        [0.0, 0.0, 1.0, 0.0, 1.0],
+        [0.0, 0.0, 1.0, 0.0, 1.0, 0.0],
     ]
 )
-"""Sums (4, 5) of the codes of `Weather`."""
+"""Sums (4, 6) of the codes of `Weather`."""
 CODE_SUM_LIMITS = np.array([1.0, _BRIGHT_RAIN, 1.0, 1.0])
 """Upper limits (4,) of CODE_SUMS."""
-RULE_NAMES = ("fog in rain", "rain without cover", "dark", "dusk at night")
+RULE_NAMES = ("fog in rain or snow", "rain without cover", "dark", "dusk at night")
 _HALVINGS = 5
 """Bisection steps of the visibility limit, to 1/32 of a change."""
 
@@ -475,7 +476,7 @@ class WeatherSet:
         )
 
     def violations(self, values: Values) -> list[str]:
-        """Violations of theta (D,), which is inside its bounds, such as `weather: fog in rain`."""
+        """Violations of theta (D,), which is inside its bounds, such as `weather: dark`."""
         change = values[self._where].astype(np.float64)
         return [f"weather: {RULE_NAMES[k]}" for k in np.flatnonzero(self._exceeded(change))] + self._invisible(
             change
@@ -520,8 +521,8 @@ class WeatherSet:
         return [f"objects[{i}]: contrast" for i in np.flatnonzero(self._find_invisible(codes))]
 
     def _find_nearest(self, codes: Array) -> Array:
-        """The point of the set nearest to codes (4,) or (5,), exactly: the distance to a polyhedron by non-negative
-        least squares (Lawson and Hanson 1974, chapter 23).
+        """The point of the set nearest to codes (4,), (5,) or (6,), exactly: the distance to a polyhedron by
+        non-negative least squares (Lawson and Hanson 1974, chapter 23).
         """
         axes = np.eye(len(codes))
         rows = np.concatenate([-self._sums, axes, -axes])

@@ -191,9 +191,11 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
     environment, then = changed.environment, still.environment
     if bool(environment.weather[Weather.NIGHT] != then.weather[Weather.NIGHT]):
         missing.append("night: generated streets are drawn by daylight")
+    if bool(environment.weather[Weather.SNOW] != then.weather[Weather.SNOW]):
+        missing.append("snow: no snow falls in generated streets")
     edit = FrameEdit(
         objects=edits,
-        weather=(*(environment.weather - then.weather).detach().clamp(0, 1).tolist()[:DAYLIGHT_DIM], 0.0),
+        weather=(*(environment.weather - then.weather).detach().clamp(0, 1).tolist()[:DAYLIGHT_DIM], 0.0, 0.0),
         foliage=tuple((environment.foliage - then.foliage).detach().clamp(-1, 1).tolist()),
         sun=tuple((environment.light - then.light).detach().clamp(-1, 1).tolist()),
     )

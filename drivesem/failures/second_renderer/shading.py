@@ -29,7 +29,7 @@ _DUST = np.array([0.47, 0.42, 0.35], np.float32)
 _DUSTLESS = 0.75
 """Share of the dust that is missing at the roof."""
 
-_FOG_PER_M, _RAIN_PER_M = 0.03, 0.006
+_FOG_PER_M, _RAIN_PER_M, _SNOW_PER_M = 0.03, 0.006, 0.0075
 _LAYER_M = 300.0
 """Thickness of the air in front of the sky."""
 _GREY_AIR = (0.78, 0.82, 0.87)
@@ -37,8 +37,8 @@ _DUSK = np.array([2.0, 1.75, 1.25], np.float32)
 """Optical depth of red, green and blue light at time code 1."""
 _GLOW = np.array([0.35, 0.0, -0.35], np.float32)
 """What a low sun adds to the logarithm of light, at half the time code."""
-_SOFTENING = np.array([0.5, 0.4, 0.5, 0.6, 0.9], np.float32)
-"""Share of a cast shadow that vanishes at code 1 of fog, rain, time, overcast, night."""
+_SOFTENING = np.array([0.5, 0.4, 0.5, 0.6, 0.9, 0.6], np.float32)
+"""Share of a cast shadow that vanishes at code 1 of fog, rain, time, overcast, night, snow."""
 
 _STREET, _HEADLAMPS = np.array([0.11, 0.085, 0.055], np.float32), np.array([0.6, 0.52, 0.4], np.float32)
 """Light of street lamps, and of the own headlamps on what is near, relative to daylight."""
@@ -46,7 +46,7 @@ _TOWN_GLOW = np.array([0.006, 0.0045, 0.0035], np.float32)
 """Light of the sky by night."""
 _BEAM_M, _BEAM_RAD, _CUT_M = 15.0, 0.35, 0.9
 """Distance at which the headlamps' light has fallen to half; half width of their beam; height of its upper edge."""
-_LAMPS_LIT = np.array([1.5, 1.2, 1.5, 0.3, 3.0], np.float32)
+_LAMPS_LIT = np.array([1.5, 1.2, 1.5, 0.3, 3.0, 1.2], np.float32)
 """How much each code of weather makes drivers switch on their lamps."""
 _TAIL, _HEAD = np.array([2.0, 0.1, 0.05], np.float32), np.array([6.0, 5.5, 4.5], np.float32)
 """Light of a vehicle's lamps by night; white is 1."""
@@ -152,11 +152,12 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
     Returns:
         (H, W, 3) RGB in [0, 1].
     """
-    fog, rain, time, overcast, _ = environment.weather.tolist()
-    if not (fog or rain or time or overcast):
+    fog, rain, time, overcast, _, snow = environment.weather.tolist()
+    if not (fog or rain or time or overcast or snow):
         return image
+    overcast = max(overcast, snow)  # it falls from a closed sky
     # Drops scatter all colours equally.
-    mist = np.exp(-1.6 * (fog + rain))
+    mist = np.exp(-1.6 * (fog + rain + snow))
     sky, road = (open_to[..., None] * to_numpy(m)[..., None] for m in (environment.sky, environment.road))
     light, air = image**_GAMMA, air**_GAMMA
     if overcast:
@@ -182,8 +183,10 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
     if rain:
         light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.65 * air - light)
         light += 0.12 * rain * _rain_streaks(*light.shape[:2])[..., None] * (air - light)
-    if fog:
-        light += (1 - np.exp(-_FOG_PER_M * fog * depth)) * (air - light)
+    if fog or snow:
+        light += (1 - np.exp(-(_FOG_PER_M * fog + _SNOW_PER_M * snow) * depth)) * (air - light)
+    if snow:
+        light += snow * _snow_flakes(*light.shape[:2])[..., None] * (air - light)
     return (light ** (1 / _GAMMA)).astype(np.float32)
 
 
@@ -263,6 +266,18 @@ def _draw_lamps(
         cv2.circle(disc, (x, y), round(radius), 1, -1)
         colour = levels[0] * _HEAD * facing**4 if along > 0 else levels[1] * _TAIL * min(2 * facing, 1)
         lamps[(disc > 0) & seen] += colour * np.exp(-extinction * place[2])
+
+
+def _snow_flakes(height: int, width: int) -> Array:
+    """Opacity (H, W) of falling flakes: some near and soft, many far and small."""
+    rng = np.random.default_rng(18)
+    opacity = np.zeros((height, width), np.float32)
+    for count, radius, share in ((40, height / 120, 0.3), (1200, height / 450, 0.5)):
+        layer = np.zeros_like(opacity)
+        for x, y in zip(rng.integers(0, width, count), rng.integers(0, height, count), strict=True):
+            cv2.circle(layer, (int(x), int(y)), round(radius), share, -1, cv2.LINE_AA)
+        opacity = np.maximum(opacity, cv2.GaussianBlur(layer, (0, 0), max(radius / 2, 0.4)))
+    return opacity
 
 
 def _reflect_in_road(light: Array) -> Array:

@@ -1,15 +1,13 @@
 # pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false, reportIndexIssue=false, reportCallIssue=false, reportInvalidTypeForm=false, reportAssignmentType=false, reportReturnType=false
 """Weather and foliage over the whole picture as fused Warp kernels, with gradients by hand; float32.
 
-The model is in `environment`, its constants in `model`. Only a wet road depends on other pixels: it mirrors the
-column above it. The rows that hold road (the wet rows) therefore go through three kernels: before the mirror, the
-mirror, after the mirror; all other rows go through one.
+The model is in `environment`, its constants in `model`. The rows that hold wet road (the wet rows) have a kernel of
+their own.
 """
 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,7 +15,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from scene_ir.raster.launch import Floats, launch, split_range, start_warp, threads
+from scene_ir.raster.launch import Floats, launch, split_range, start_warp
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, load3, store, store3, sum3
 from scene_ir.render import model
 from scene_ir.render.kernels.colour import (
@@ -32,7 +30,7 @@ from scene_ir.render.kernels.colour import (
     rgb_to_lab_adjoint,
     scale_odds,
 )
-from scene_ir.types import DAYLIGHT_DIM, Environment
+from scene_ir.types import Environment
 
 start_warp()
 wp.set_module_options(SIMD_OPTIONS)
@@ -46,7 +44,8 @@ FLAT_LIGHT = model.OVERCAST_TO - model.OVERCAST_CONTRAST * model.OVERCAST_FROM
 COVER_AIR = model.COVER_AIR - model.COVER_STRUCTURE
 """Overcast, multiplied out."""
 DAMP, DAMP_GREY = (model.DAMP_LIGHT * share for share in (model.DAMP_COLOUR, 1.0 - model.DAMP_COLOUR))
-SHEEN_FROM, SHEEN_OVER = model.SHEEN_M[0], model.SHEEN_M[1] - model.SHEEN_M[0]
+FILM_NEAR, FRESNEL = model.FILM * model.WATER, model.FILM * (1.0 - model.WATER)
+WET_ROAD, WET_CHANGE = model.WET_ROAD, model.WET_ROAD - 1.0
 THICK = model.THICK_SHARE * (1.0 - model.THICK_DARKNESS)
 LEVEL_LOW, LEVEL_HIGH = model.LEVEL
 LEAF_TURN_SLOPE = model.LEAF_TURN_MORE * model.LEAF_TURN_BEND
@@ -55,16 +54,14 @@ DARKENING = wp.constant(wp.vec3d(*model.DARKENING))
 WARMTH = wp.constant(wp.vec3d(*model.WARMTH))
 TWILIGHT_SKY = wp.constant(wp.vec3d(*model.TWILIGHT_SKY))
 
-_STRIP = 64
-"""Columns that a CPU thread smears at a time; `_mirror_columns` and its adjoint have room for this many."""
 (OVERCAST, WET, MIST, COVER) = range(4)
 (GAIN, GAIN_SLOPE, GAIN_BY_SUN, SKY_GAIN, SKY_GAIN_SLOPE) = range(4, 19, 3)
 (AIR, AIR_BY_OVERCAST, AIR_BY_TIME, AIR_BY_SUN, AIR_BY_HAZE) = range(19, 34, 3)
-SETTINGS = 34
+CAMERA, SETTINGS = 34, 35
 """First index of each setting, equal for all pixels, and their count: weight of overcast; rain; fog; overcast of a
-black sky; gain of the time of day (3), its slopes along time (3) and the low sun's share (3); the sky's further gain (3)
-and its slope along time (3); airlight (3), its slopes along overcast, time and the low sun's share (3 each), and its change by either of fog and rain, fully on alone
-(3).
+black sky; gain of the time of day (3), its slopes along time (3) and the low sun's share (3); the sky's further gain
+(3) and its slope along time (3); airlight (3), its slopes along overcast, time and the low sun's share (3 each), and
+its change by either of fog and rain, fully on alone (3); height of the camera, m.
 """
 CODES = 5
 """Codes of the kernels: fog, rain, time, overcast, the low sun's share."""
@@ -76,7 +73,7 @@ def _grey_air(air: Floats):
 
 
 @wp.kernel
-def _settings_kernel(start: int, code: Floats, air: Floats, settings: Floats):
+def _settings_kernel(start: int, code: Floats, air: Floats, camera: Floats, settings: Floats):
     """One thread per channel."""
     c = start + wp.tid()
     time = wp.float64(code[2])
@@ -109,6 +106,7 @@ def _settings_kernel(start: int, code: Floats, air: Floats, settings: Floats):
         settings[OVERCAST] = wp.float32(overcast)
         settings[WET] = code[1]
         settings[MIST] = code[0]
+        settings[CAMERA] = camera[0]
         settings[COVER] = wp.float32(wp.float64(COVER_AIR) * _luma + wp.float64(model.COVER_LIGHT))
     settings[GAIN + c] = wp.float32(gain)
     settings[GAIN_SLOPE + c] = wp.float32(slope)
@@ -166,14 +164,14 @@ def _haze_depth(inverse: wp.float32):
 
 
 @wp.func
-def _sheen_share(depth: wp.float32):
-    return wp.min(wp.max((depth - SHEEN_FROM) * (1.0 / SHEEN_OVER), 0.0), 1.0)
-
-
-@wp.func
-def _grazing_sheen(depth: wp.float32):
-    t = _sheen_share(depth)
-    return model.SHEEN_NEAR + model.SHEEN_FAR * (t * t * (3.0 - 2.0 * t))
+def _mirror_share(depth: wp.float32, settings: Floats):
+    """Share of light that a wet road mirrors, and its slope along the depth."""
+    camera = load(settings, CAMERA)
+    square = camera * camera + depth * depth
+    cos = camera / wp.sqrt(square)
+    away = 1.0 - cos
+    bent = FRESNEL * away * away * away * away
+    return FILM_NEAR + bent * away, 5.0 * bent * cos * depth / square
 
 
 @wp.func
@@ -211,9 +209,9 @@ def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: Fl
 
 
 @wp.func
-def _apply_sheen(x: wp.vec3f, mirrored: wp.vec3f, wet: wp.float32, settings: Floats):
-    """A pixel with the share `wet` in [0, 1] of the road's sheen."""
-    return x + wet * (model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, AIR, 1) - x)
+def _sheen(x: wp.vec3f, mirrored: wp.vec3f, settings: Floats):
+    """What a road mirrors, less its own colour."""
+    return model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * load3(settings, AIR, 1) - WET_ROAD * x
 
 
 @wp.kernel
@@ -233,33 +231,26 @@ def _dry_kernel(
 
 
 @wp.kernel
-def _damp_kernel(
-    start: int, settings: Floats, image: Floats, sky: Floats, plane: int, first: int, wet_pixels: int, out: Floats
-):
-    """Pixels before the mirror; out: planes of `wet_pixels` numbers, from pixel `first` on."""
-    i = start + wp.tid()
-    store3(out, i - first, wet_pixels, _dampen(load3(image, i, plane), load(sky, i), settings))
-
-
-@wp.kernel
 def _wet_kernel(
     start: int,
     settings: Floats,
-    damp: Floats,
-    mirrored: Floats,
-    first: int,
-    wet_pixels: int,
+    image: Floats,
     inverse: Floats,
-    road: Floats,
+    sky: Floats,
     streaks: Floats,
     plane: int,
+    road: Floats,
+    mirrored: Floats,
     out: Floats,
 ):
     i = start + wp.tid()
     depth = _haze_depth(load(inverse, i))
-    share = load(settings, WET) * (load(road, i) * _grazing_sheen(depth))
-    x = _apply_sheen(load3(damp, i - first, wet_pixels), load3(mirrored, i - first, wet_pixels), share, settings)
-    store3(out, i, plane, _apply_haze(x, depth, load(streaks, i), settings))
+    x = _dampen(load3(image, i, plane), load(sky, i), settings)
+    mirror = _dampen(load3(mirrored, i, plane), load(mirrored, i + 3 * plane), settings)
+    share, _slope = _mirror_share(depth, settings)
+    change = WET_CHANGE * x + share * _sheen(x, mirror, settings)
+    wetted = x + (load(settings, WET) * load(road, i)) * change
+    store3(out, i, plane, _apply_haze(wetted, depth, load(streaks, i), settings))
 
 
 @wp.func
@@ -296,16 +287,16 @@ def _haze_adjoint(
     g: wp.vec3f,
     settings: Floats,
 ):
-    """Gradients of `_apply_sheen` and `_apply_haze` to x, mirrored, fog, the other codes (4), inverse, road."""
+    """Gradients of the wet road and `_apply_haze` to x, mirrored, fog, the other codes (4), inverse, road."""
     rain = load(settings, WET)
     fog = load(settings, MIST)
     air = load3(settings, AIR, 1)
     depth = _haze_depth(inverse)
-    t = _sheen_share(depth)
-    seen = road * _grazing_sheen(depth)
-    wet = rain * seen
-    sheen = model.SHEEN_MIRROR * mirrored + model.SHEEN_AIR * air - x
-    wetted = x + wet * sheen
+    share, slope = _mirror_share(depth, settings)
+    wet = rain * road
+    sheen = _sheen(x, mirrored, settings)
+    change = WET_CHANGE * x + share * sheen
+    wetted = x + wet * change
     clear = exp_(-RAIN * rain * depth)
     haze = model.RAIN_AIR * air
     far = _apply_veil(wetted, 1.0 - clear, haze)
@@ -318,26 +309,25 @@ def _haze_adjoint(
     g_haze = (1.0 - model.STREAKS * rain * streak) * g_far
     g_wet, g_veil, g_haze_air = _apply_veil_adjoint(wetted, 1.0 - clear, haze, g_haze)
     g_hazed = RAIN * clear * g_veil
-    g_sheen = wp.dot(g_wet, sheen)
+    g_change = wp.dot(g_wet, change)
     g_air = (
         g_fog_air
         + (model.STREAKS * rain * streak) * g_far
         + model.RAIN_AIR * g_haze_air
-        + (model.SHEEN_AIR * wet) * g_wet
+        + (model.SHEEN_AIR * wet * share) * g_wet
     )
     g_grey = wp.dot(g_air, load3(settings, AIR_BY_HAZE, 1))
     to_fog = g_fogged * depth + (1.0 - rain) * g_grey
     codes = wp.vec4f(
-        g_hazed * depth + model.STREAKS * streak * g_streak + seen * g_sheen + (1.0 - fog) * g_grey,
+        g_hazed * depth + model.STREAKS * streak * g_streak + road * g_change + (1.0 - fog) * g_grey,
         wp.dot(g_air, load3(settings, AIR_BY_TIME, 1)),
         wp.dot(g_air, load3(settings, AIR_BY_OVERCAST, 1)),
         wp.dot(g_air, load3(settings, AIR_BY_SUN, 1)),
     )
-    bend = (model.SHEEN_FAR * 6.0 / SHEEN_OVER) * (t - t * t)
-    g_depth = g_fogged * fog + g_hazed * rain + g_sheen * rain * road * bend
+    g_depth = g_fogged * fog + g_hazed * rain + wet * slope * wp.dot(g_wet, sheen)
     g_inverse = wp.where(inverse >= NEAREST, -(depth * depth) * g_depth, 0.0)
-    g_road = g_sheen * rain * _grazing_sheen(depth)
-    return (1.0 - wet) * g_wet, (model.SHEEN_MIRROR * wet) * g_wet, to_fog, codes, g_inverse, g_road
+    g_x = (1.0 + wet * (WET_CHANGE - WET_ROAD * share)) * g_wet
+    return g_x, (model.SHEEN_MIRROR * wet * share) * g_wet, to_fog, codes, g_inverse, rain * g_change
 
 
 @wp.func
@@ -393,177 +383,36 @@ def _wet_adjoint_kernel(
     grad: Floats,
     road: Floats,
     mirrored: Floats,
-    first: int,
-    wet_pixels: int,
     grad_mirrored: Floats,
     grad_image: Floats,
     grad_inverse: Floats,
     code_parts: Floats,
     grad_maps: Floats,
 ):
-    """Back to the mirror: grad_image receives the gradient to the picture before it."""
     i = start + wp.tid()
-    x = _dampen(load3(image, i, plane), load(sky, i), settings)
-    g, g_mirrored, to_fog, codes, g_inverse, g_road = _haze_adjoint(
-        x,
-        load3(mirrored, i - first, wet_pixels),
+    colour = load3(image, i, plane)
+    sky_share = load(sky, i)
+    mirror_colour = load3(mirrored, i, plane)
+    mirror_sky = load(mirrored, i + 3 * plane)
+    g, g_mirror, to_fog, codes, g_inverse, g_road = _haze_adjoint(
+        _dampen(colour, sky_share, settings),
+        _dampen(mirror_colour, mirror_sky, settings),
         load(road, i),
         load(inverse, i),
         load(streaks, i),
         load3(grad, i, plane),
         settings,
     )
-    store3(grad_mirrored, i - first, wet_pixels, g_mirrored)
-    store3(grad_image, i, plane, g)
+    g_colour, parts, g_sky = _dampen_adjoint(colour, sky_share, g, settings)
+    g_mirrored, mirror_parts, g_mirror_sky = _dampen_adjoint(mirror_colour, mirror_sky, g_mirror, settings)
+    store3(grad_image, i, plane, g_colour)
+    store3(grad_mirrored, i, plane, g_mirrored)
+    store(grad_mirrored, i + 3 * plane, g_mirror_sky)
     store(grad_inverse, i, g_inverse)
     store(code_parts, i, to_fog)
-    _store4(code_parts, i + plane, plane, codes)
-    store(grad_maps, i + plane, g_road)
-
-
-@wp.kernel
-def _damp_adjoint_kernel(
-    start: int,
-    settings: Floats,
-    image: Floats,
-    sky: Floats,
-    plane: int,
-    grad_damp: Floats,
-    first: int,
-    wet_pixels: int,
-    grad_image: Floats,
-    code_parts: Floats,
-    grad_maps: Floats,
-):
-    """From before the mirror back to the picture; grad_damp comes through the mirror."""
-    i = start + wp.tid()
-    g = load3(grad_image, i, plane) + load3(grad_damp, i - first, wet_pixels)
-    g_colour, parts, g_sky = _dampen_adjoint(load3(image, i, plane), load(sky, i), g, settings)
-    store3(grad_image, i, plane, g_colour)
-    first_parts = load3(code_parts, i + plane, plane)
-    last_part = load(code_parts, i + 4 * plane)
-    _store4(
-        code_parts, i + plane, plane, wp.vec4f(first_parts[0], first_parts[1], first_parts[2], last_part) + parts
-    )
+    _store4(code_parts, i + plane, plane, codes + parts + mirror_parts)
     store(grad_maps, i, g_sky)
-
-
-@wp.func_native("""
-    // Sums run down the columns [left, right) in double, then over each three of them.
-    const float* from = (const float*)source.data + plane * wet_pixels;
-    float* to = (float*)target.data + plane * wet_pixels;
-    const int end = x0 + columns < width ? x0 + columns : width;
-    const int left = x0 > 0 ? x0 - 1 : 0, right = end < width ? end + 1 : width;
-    const int begin = road_top > radius ? road_top : radius;
-    const double scale = 1.0 / (3.0 * (2 * radius + 1));
-    double sums[66];
-    for (int k = 0; k < right - left; ++k) sums[k] = 0.0;
-    for (int j = begin - 2 * radius; j <= begin; ++j) {
-        const int row = j < top ? top : (j < bottom ? j : bottom - 1);
-        for (int k = 0; k < right - left; ++k) sums[k] += from[(row - top) * width + left + k];
-    }
-    for (int y = top; y < bottom; ++y) {
-        float* __restrict__ out = to + (y - top) * width;
-        if (y < road_top) {
-            for (int x = x0; x < end; ++x) out[x] = 0.0f;
-            continue;
-        }
-        if (y > begin) {
-            const int gone = y - 2 * radius - 1;
-            const float* __restrict__ enter = from + (y - top) * width + left;
-            const float* __restrict__ leave = from + ((gone < top ? top : gone) - top) * width + left;
-            for (int k = 0; k < right - left; ++k) sums[k] += (double)enter[k] - (double)leave[k];
-        }
-        for (int x = x0; x < end; ++x) {
-            const int k = x - left;
-            out[x] = (float)(scale * (sums[x > 0 ? k - 1 : 0] + sums[k] + sums[x < width - 1 ? k + 1 : k]));
-        }
-    }
-""")
-def _mirror_columns(
-    source: Floats, target: Floats, plane: int, wet_pixels: int, x0: int,
-    columns: int, width: int, top: int, bottom: int, road_top: int, radius: int,
-):  # fmt: skip
-    """Reflection in columns [x0, x0 + columns), rows [road_top, bottom); 0 above, from `top` on."""
-
-
-@wp.func_native("""
-    // Row y of the mirror sums the rows j in [Y - 2 radius, Y] of the picture, Y = max(y, radius); those above the
-    // picture are its first row. So row j gathers the mirror's rows with Y in [j, j + 2 radius].
-    const float* from = (const float*)source.data + plane * wet_pixels;
-    float* to = (float*)target.data + plane * wet_pixels;
-    const int end = x0 + columns < width ? x0 + columns : width;
-    const int left = x0 > 0 ? x0 - 1 : 0, right = end < width ? end + 1 : width;
-    const double scale = 1.0 / (3.0 * (2 * radius + 1));
-    double sums[66];
-    for (int k = 0; k < right - left; ++k) sums[k] = 0.0;
-    for (int y = top; y < bottom; ++y)
-        for (int x = x0; x < end; ++x) to[(y - top) * width + x] = 0.0f;
-    for (int j = bottom - 1 > radius ? bottom - 1 : radius; j >= (top > 0 ? top : -radius); --j) {
-        for (int y = j > radius ? j : top; j >= radius && y <= j && y < bottom; ++y)
-            for (int k = 0; k < right - left; ++k) sums[k] += from[(y - top) * width + left + k];
-        const int gone = j + 2 * radius + 1;
-        if (gone < bottom)
-            for (int k = 0; k < right - left; ++k) sums[k] -= from[(gone - top) * width + left + k];
-        const int row = j < top ? top : (j < bottom ? j : bottom - 1);
-        float* __restrict__ out = to + (row - top) * width;
-        for (int x = x0; x < end; ++x) {
-            const int k = x - left;
-            out[x] += (float)(scale * (sums[x > 0 ? k - 1 : 0] + sums[k] + sums[x < width - 1 ? k + 1 : k]));
-        }
-    }
-""")
-def _mirror_columns_adjoint(
-    source: Floats, target: Floats, plane: int, wet_pixels: int, x0: int,
-    columns: int, width: int, top: int, bottom: int, radius: int,
-):  # fmt: skip
-    """The transpose of `_mirror_columns`."""
-
-
-@wp.kernel
-def _mirror_kernel(
-    start: int,
-    source: Floats,
-    target: Floats,
-    columns: int,
-    width: int,
-    top: int,
-    bottom: int,
-    road_top: int,
-    radius: int,
-    forward: bool,
-):
-    """A thread processes `columns` columns of a channel."""
-    t = start + wp.tid()
-    strips = (width + columns - 1) // columns
-    wet_pixels = (bottom - top) * width
-    x0 = (t % strips) * columns
-    if forward:
-        _mirror_columns(source, target, t // strips, wet_pixels, x0, columns, width, top, bottom, road_top, radius)
-    else:
-        _mirror_columns_adjoint(source, target, t // strips, wet_pixels, x0, columns, width, top, bottom, radius)
-
-
-@dataclass(frozen=True, slots=True)
-class _WetRows:
-    """Rows [top, bottom) that hold the road or what it mirrors; the road starts at row road_top."""
-
-    top: int
-    bottom: int
-    road_top: int
-    radius: int
-
-    @classmethod
-    def from_road(cls, road: Tensor) -> _WetRows:
-        height = road.shape[0]
-        radius = model.mirror_reach(height) // 2
-        if road.is_cuda:  # finding the road would make the CPU wait
-            return cls(0, height, 0, radius)
-        first, last = _rows(road, 0.0)
-        if first == last:
-            return cls(0, 0, 0, radius)
-        bottom = min(height, max(last, radius + 1))
-        return cls(max(0, max(first, radius) - 2 * radius), bottom, first, radius)
+    store(grad_maps, i + plane, g_road)
 
 
 def _rows(values: Tensor, above: float) -> tuple[int, int]:
@@ -595,7 +444,9 @@ _scratch = _ScratchMemory()
 
 
 class _Weather(torch.autograd.Function):
-    """Weather over image (3, H, W) at inverse depth (H, W); code (5,), air (3,); sky, road, streaks (H, W)."""
+    """Weather over image (3, H, W) at inverse depth (H, W); code (5,), air (3,), camera (1,); sky, road, streaks
+    (H, W); mirrored (4, H, W) or None.
+    """
 
     @staticmethod
     def forward(
@@ -604,71 +455,57 @@ class _Weather(torch.autograd.Function):
         inverse: Tensor,
         code: Tensor,
         air: Tensor,
+        camera: Tensor,
         sky: Tensor,
         road: Tensor,
         streaks: Tensor,
+        mirrored: Tensor | None,
     ) -> Tensor:
         height, width = image.shape[1:]
-        plane, wet = height * width, _WetRows.from_road(road)
-        first, last = wet.top * width, wet.bottom * width
-        wet_pixels = last - first
         settings, out = image.new_empty(SETTINGS), image.new_empty(image.shape)
-        damp, mirrored = _scratch.planes(image, 3 * wet_pixels)[0], image.new_empty(3 * wet_pixels)
-        saved_maps = [t.detach().contiguous() for t in (image, inverse, sky, road, streaks)]
-        image_in, inverse_in, sky_in, road_in, streaks_in = (flat_array(t) for t in saved_maps)
-        settings_in, out_array, damp_out, mirror_out = (flat_array(t) for t in (settings, out, damp, mirrored))
-        launch(_settings_kernel, [0, 3], [flat_array(code), flat_array(air), settings_in])
-        for top, bottom in ((0, wet.top), (wet.bottom, height)):
-            inputs = [settings_in, image_in, inverse_in, sky_in, streaks_in, plane]
-            launch(_dry_kernel, _ranges(top * width, bottom * width), [*inputs, out_array])
-        inputs = [settings_in, image_in, sky_in, plane, first, wet_pixels, damp_out]
-        launch(_damp_kernel, _ranges(first, last), inputs)
-        _launch_mirror(wet, width, damp_out, mirror_out, True)
-        inputs = [settings_in, damp_out, mirror_out, first, wet_pixels, inverse_in, road_in, streaks_in, plane]
-        launch(_wet_kernel, _ranges(first, last), [*inputs, out_array])
-        ctx.save_for_backward(*saved_maps, settings, mirrored)
-        ctx.wet = wet
+        if mirrored is None:
+            top, bottom, mirrored = 0, 0, image.new_empty(0)
+        else:  # finding the road would make the CPU wait for a GPU
+            top, bottom = (0, height) if road.is_cuda else _rows(road, 0.0)
+        saved = [t.detach().contiguous() for t in (image, inverse, sky, streaks, road, mirrored)]
+        settings_in = flat_array(settings)
+        constants = [flat_array(t) for t in (code, air, camera)]
+        launch(_settings_kernel, [0, 3], [*constants, settings_in])
+        *inputs, road_in, mirrored_in = (flat_array(t) for t in saved)
+        inputs = [settings_in, *inputs, height * width]
+        for first, last in ((0, top), (bottom, height)):
+            launch(_dry_kernel, _ranges(first * width, last * width), [*inputs, flat_array(out)])
+        through = [road_in, mirrored_in, flat_array(out)]
+        launch(_wet_kernel, _ranges(top * width, bottom * width), [*inputs, *through])
+        ctx.save_for_backward(*saved, settings)
+        ctx.rows = (top, bottom)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        wet: _WetRows = ctx.wet
-        image, inverse, *_ = ctx.saved_tensors
-        image_in, inverse_in, sky_in, road_in, streaks_in, settings_in, mirror_out = (
-            flat_array(t) for t in ctx.saved_tensors
-        )
+        top, bottom = ctx.rows
+        image, inverse, _, _, _, mirrored, _ = ctx.saved_tensors
+        *inputs, road_in, mirrored_in, settings_in = (flat_array(t) for t in ctx.saved_tensors)
         height, width = inverse.shape
-        plane, first, last = height * width, wet.top * width, wet.bottom * width
+        plane = height * width
         grad_image, grad_inverse = torch.empty_like(image), torch.empty_like(inverse)
-        grad_maps = image.new_empty(2, height, width)
-        scratch = _scratch.planes(image, CODES * plane, 3 * (last - first), 3 * (last - first))
-        parts, to_mirror, to_damp = (flat_array(t) for t in scratch)
-        inputs = [settings_in, image_in, inverse_in, sky_in, streaks_in, plane, flat_array(grad)]
-        outputs = [flat_array(grad_image), flat_array(grad_inverse), parts, flat_array(grad_maps)]
-        for top, bottom in ((0, wet.top), (wet.bottom, height)):
-            launch(_dry_adjoint_kernel, _ranges(top * width, bottom * width), [*inputs, *outputs])
-        through = [road_in, mirror_out, first, last - first, to_mirror]
-        launch(_wet_adjoint_kernel, _ranges(first, last), [*inputs, *through, *outputs])
-        _launch_mirror(wet, width, to_mirror, to_damp, False)
-        inputs = [settings_in, image_in, sky_in, plane, to_damp, first, last - first]
-        launch(_damp_adjoint_kernel, _ranges(first, last), [*inputs, outputs[0], *outputs[2:]])
-        grad_code = _sum_rows_first(scratch[0].view(CODES, height, width))
-        return grad_image, grad_inverse, grad_code, None, *grad_maps, None
+        grad_maps, grad_mirrored = image.new_empty(2, height, width), torch.zeros_like(mirrored)
+        parts = _scratch.planes(image, CODES * plane)[0]
+        inputs = [settings_in, *inputs, plane, flat_array(grad.contiguous())]
+        outputs = [flat_array(t) for t in (grad_image, grad_inverse, parts, grad_maps)]
+        for first, last in ((0, top), (bottom, height)):
+            launch(_dry_adjoint_kernel, _ranges(first * width, last * width), [*inputs, *outputs])
+        through = [road_in, mirrored_in, flat_array(grad_mirrored)]
+        launch(_wet_adjoint_kernel, _ranges(top * width, bottom * width), [*inputs, *through, *outputs])
+        grad_code = _sum_rows_first(parts.view(CODES, height, width))
+        to_mirrored = grad_mirrored if mirrored.numel() else None
+        return grad_image, grad_inverse, grad_code, None, None, *grad_maps, None, to_mirrored
 
 
 def _sum_rows_first(code_parts: Tensor) -> Tensor:
     """Sums (K,) of planes (K, H, W), rows first, so that they do not depend on the number of threads."""
     return code_parts.sum(dim=2).sum(dim=1)
-
-
-def _launch_mirror(wet: _WetRows, width: int, source: Any, out_array: Any, forward: bool) -> None:
-    columns = 1 if source.device.is_cuda else _STRIP
-    count = 3 * -(-width // columns) if wet.bottom > wet.top else 0
-    parts = 1 if source.device.is_cuda else threads()
-    edges = [count * i // parts for i in range(parts + 1)]
-    inputs = [source, out_array, columns, width, wet.top, wet.bottom, wet.road_top, wet.radius, forward]
-    launch(_mirror_kernel, edges, inputs)
 
 
 ODDS, CHROMA, COS, SIN, RED, YELLOW, THICKER, THINNER, TURN_SLOPE, THICKER_SLOPE, THINNER_SLOPE = range(11)
@@ -908,19 +745,19 @@ class _Foliage(torch.autograd.Function):
 
 
 def apply_weather(
-    image: Tensor, inverse: Tensor, environment: Environment, air: Tensor, low_sun: Tensor, streaks: Tensor
+    image: Tensor,
+    inverse: Tensor,
+    weather: Tensor,
+    air: Tensor,
+    environment: Environment,
+    mirrored: Tensor | None,
+    streaks: Tensor,
 ) -> Tensor:
-    """See `environment.apply_weather`; float32, the airlight constant.
-
-    Args:
-        image, inverse, environment, air: As there.
-        low_sun: () of `environment.low_sun_share`.
-        streaks: (H, W) in [0, 1].
-    """
-    code, maps = environment.weather.to(image), (environment.sky.to(image), environment.road.to(image))
-    fog, rain, time, overcast = code[:DAYLIGHT_DIM]
-    code = torch.stack([fog, rain, time, overcast, low_sun])
-    return _Weather.apply(image, inverse, code, air.to(image).detach(), *maps, streaks)
+    """See `environment.apply_weather`; float32, the airlight constant."""
+    sky, road, ground = (getattr(environment, name).to(image) for name in ("sky", "road", "ground"))
+    return _Weather.apply(
+        image, inverse, weather, air.to(image).detach(), ground[3:].detach(), sky, road, streaks, mirrored
+    )
 
 
 def apply_foliage(image: Tensor, environment: Environment, crowns: Tensor) -> Tensor:

@@ -83,11 +83,14 @@ def test_each_code_reaches_its_end(street, code):
 @pytest.mark.parametrize(
     ("code", "names"),
     [
-        ([1.0, 1.0, 0.0, 1.0, 0.0], ("weather: fog in rain",)),
+        ([1.0, 1.0, 0.0, 1.0, 0.0], ("weather: fog in rain or snow",)),
         ([0.0, 1.0, 0.0, 0.0, 0.0], ("weather: rain without cover",)),
         ([0.0, 0.0, 1.0, 1.0, 0.0], ("weather: dark",)),
         ([0.0, 0.0, 0.6, 0.0, 0.6], ("weather: dusk at night",)),
-        ([1.0, 1.0, 1.0, 0.2, 0.0], ("weather: fog in rain", "weather: rain without cover", "weather: dark")),
+        (
+            [1.0, 1.0, 1.0, 0.2, 0.0],
+            ("weather: fog in rain or snow", "weather: rain without cover", "weather: dark"),
+        ),
     ],
 )
 def test_what_holds_back_is_named(street, code, names):

@@ -11,13 +11,15 @@ from torch import Tensor
 
 from scene_ir.render import environment as env
 from scene_ir.render import texture
-from scene_ir.types import Environment
+from scene_ir.types import WEATHER_DIM, Environment, Weather
 
 VALUES = {"weather": 1e-6, "foliage": 2e-5, "paint": 8e-6}
 """Largest difference to float64. The reference itself, in float32, is off by 0.3e-6, 0.7e-5 and 0.3e-5: near black
 CIE's curves are steep."""
 GRADIENTS = 1e-4
 
+_APPLIED = [code for code in Weather if code is not Weather.NIGHT]
+"""Codes of `apply_weather`."""
 SIZES = ((2, 2), (3, 70), (41, 3), (40, 64), (59, 131))
 FRAMES = st.tuples(st.sampled_from(SIZES), st.integers(0, 61)).map(lambda f: (*f[0], f[1]))
 """Height, width (few: each has rain streaks to make), and the first row of the road, maybe below the picture."""
@@ -47,6 +49,11 @@ def _scenery(height: int, width: int, road_row: int) -> tuple[Tensor, Tensor, En
     return image, inverse, scenery, torch.tensor([0.75, 0.8, 0.86]).float().double()
 
 
+def _mirrored(height: int, width: int, road_row: int) -> Tensor:
+    """What a wet road mirrors: picture and sky."""
+    return torch.rand(4, height, width, generator=torch.Generator().manual_seed(road_row)).double()
+
+
 def _run(name: str, code: list[float], frame: tuple[int, int, int], backend: str) -> list[Tensor]:
     """Picture and gradients; float64 with the reference, float32 with Warp."""
     image, inverse, scenery, air = _scenery(*frame)
@@ -55,10 +62,11 @@ def _run(name: str, code: list[float], frame: tuple[int, int, int], backend: str
     live = [t.float().to(dtype).requires_grad_() for t in (image, torch.tensor(code), inverse)]
     scenery = replace(scenery, weather=scenery.weather.to(dtype), **maps)
     if name == "weather":
-        # How much of sky and road shows, as of what cars hide.
-        live.append(torch.ones_like(maps["sky"]).requires_grad_())
+        # How much of sky and road shows, as of what cars hide; what a wet road mirrors.
+        live += [torch.ones_like(maps["sky"]), _mirrored(*frame).to(dtype)]
+        live[3:] = [t.requires_grad_() for t in live[3:]]
         changed = replace(scenery, weather=live[1], sky=live[3] * maps["sky"], road=live[3] * maps["road"])
-        out = env.apply_weather(live[0], live[2], changed, air.to(dtype), backend=backend)  # type: ignore[arg-type]
+        out = env.apply_weather(live[0], live[2], changed, air.to(dtype), live[4], backend)  # type: ignore[arg-type]
     else:
         live.pop()
         changed = replace(scenery, foliage=live[1])
@@ -76,7 +84,7 @@ def _agree(fast: list[Tensor], reference: list[Tensor], values: float) -> None:
 
 
 @settings(max_examples=25)
-@given(_codes(4, 0.0, 1.0), FRAMES)
+@given(_codes(WEATHER_DIM, 0.0, 1.0), FRAMES)
 def test_weather_agrees_with_the_reference(code: list[float], frame: tuple[int, int, int]) -> None:
     _agree(_run("weather", code, frame, "warp"), _run("weather", code, frame, "reference"), VALUES["weather"])
 
@@ -87,23 +95,24 @@ def test_foliage_agrees_with_the_reference(code: list[float], frame: tuple[int, 
     _agree(_run("foliage", code, frame, "warp"), _run("foliage", code, frame, "reference"), VALUES["foliage"])
 
 
-@pytest.mark.parametrize(("name", "size"), [("weather", 4), ("foliage", 3)])
+@pytest.mark.parametrize(("name", "size"), [("weather", WEATHER_DIM), ("foliage", 3)])
 @pytest.mark.parametrize("frame", [(40, 64, 24), (37, 51, 0), (9, 130, 90)])
 def test_code_zero_changes_no_bit(name: str, size: int, frame: tuple[int, int, int]) -> None:
     out, *gradients = _run(name, [0.0] * size, frame, "warp")
     assert torch.equal(out, _scenery(*frame)[0].float())
-    assert bool((gradients[1].abs() > 1e-3).all())
+    by_code = gradients[1] if name == "foliage" else gradients[1][_APPLIED]
+    assert bool((by_code.abs() > 1e-3).all())
 
 
 @pytest.mark.parametrize("name", ["weather", "foliage"])
 def test_same_bytes_with_any_number_of_threads(name: str) -> None:
-    code, threads = [0.3, 0.6, 0.4, 0.2], torch.get_num_threads()
+    code, threads = [0.3, 0.6, 0.4, 0.2, 0.0, 0.3], torch.get_num_threads()
     frame = (100, 130, 50)
     try:
         runs = []
         for count in (1, 2, 3, 2):
             torch.set_num_threads(count)
-            runs.append(_run(name, code[: 4 if name == "weather" else 3], frame, "warp"))
+            runs.append(_run(name, code[: WEATHER_DIM if name == "weather" else 3], frame, "warp"))
     finally:
         torch.set_num_threads(threads)
     for run in runs[1:]:
@@ -111,14 +120,21 @@ def test_same_bytes_with_any_number_of_threads(name: str) -> None:
 
 
 def test_two_pictures_can_await_their_gradients() -> None:
-    first = _run("weather", [0.5, 0.5, 0.5, 0.5], (40, 60, 10), "warp")
+    first = _run("weather", [0.5] * WEATHER_DIM, (40, 60, 10), "warp")
     image, inverse, scenery, air = _scenery(40, 60, 10)
     names = ("sky", "road", "foliage_map", "sun", "ground", "foliage")
     single = replace(scenery, **{n: getattr(scenery, n).float() for n in names})
-    code, other = (torch.full((4,), v, requires_grad=True) for v in (0.5, 0.1))
+    code, other = (torch.full((WEATHER_DIM,), v, requires_grad=True) for v in (0.5, 0.1))
     weights = torch.randn(3, 40, 60, generator=torch.Generator().manual_seed(3))
     outs = [
-        env.apply_weather(image.float(), inverse.float(), replace(single, weather=c), air.float(), "warp")
+        env.apply_weather(
+            image.float(),
+            inverse.float(),
+            replace(single, weather=c),
+            air.float(),
+            _mirrored(40, 60, 10).float(),
+            "warp",
+        )
         for c in (code, other)
     ]
     assert torch.equal(torch.autograd.grad(outs[0], code, weights)[0], first[2])

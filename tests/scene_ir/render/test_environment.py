@@ -12,7 +12,9 @@ from scene_ir.render import model
 from scene_ir.types import WEATHER_DIM, Environment, SceneIR
 
 H, W = 40, 64
-FOG, RAIN, TIME, OVERCAST = range(4)
+FOG, RAIN, TIME, OVERCAST, SNOW = range(5)
+"""Codes of these tests: all but night's."""
+CODES = 5
 
 
 def _inputs(dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Environment, Tensor]:
@@ -32,7 +34,9 @@ def _inputs(dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Environ
 
 def _weather(code: Tensor) -> tuple[Tensor, Tensor]:
     image, inverse, scenery, air = _inputs(code.dtype)
-    return image, env.apply_weather(image, inverse, replace(scenery, weather=code), air)
+    changed = replace(scenery, weather=torch.cat([code[:SNOW], code.new_zeros(1), code[SNOW:]]))
+    out = env.apply_weather(image, inverse, changed, air, torch.cat([image, scenery.sky[None]]))
+    return image, env.add_flakes(out, inverse, changed, air)
 
 
 def _foliage(code: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,14 +51,14 @@ def _crowns(air: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("function", "size"), [(_weather, 4), (_foliage, 3)])
+@pytest.mark.parametrize(("function", "size"), [(_weather, CODES), (_foliage, 3)])
 def test_code_zero_changes_no_bit(function, size: int, dtype: torch.dtype) -> None:
     before, after = function(torch.zeros(size, dtype=dtype))
     assert torch.equal(before, after)
 
 
 @pytest.mark.parametrize("start", [0.0, 0.35])
-@pytest.mark.parametrize(("function", "size"), [(_weather, 4), (_foliage, 3)])
+@pytest.mark.parametrize(("function", "size"), [(_weather, CODES), (_foliage, 3)])
 def test_code_gradient_matches_differences_also_at_zero(
     check_code_gradient: Callable[..., None], function, size: int, start: float
 ) -> None:
@@ -62,7 +66,7 @@ def test_code_gradient_matches_differences_also_at_zero(
 
 
 def _code(index: int, value: float) -> Tensor:
-    return torch.eye(4, dtype=torch.float64)[index] * value
+    return torch.eye(CODES, dtype=torch.float64)[index] * value
 
 
 def test_fog_follows_koschmieder_in_light(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +122,7 @@ def test_overcast_and_rain_reduce_colour_and_contrast() -> None:
 
 
 def test_weather_stays_in_range_and_is_deterministic() -> None:
-    code = torch.ones(4, dtype=torch.float64) * 0.8
+    code = torch.ones(CODES, dtype=torch.float64) * 0.8
     _, after = _weather(code)
     assert float(after.min()) > -0.05
     assert float(after.max()) < 1.05
