@@ -45,10 +45,11 @@ def low_sun_share(fog: Tensor, rain: Tensor, overcast: Tensor) -> Tensor:
 
 
 def sunlight_share(weather: Tensor) -> Tensor:
-    """Share () of the photographed sunlight that is left under a weather code (5,); 1 at code 0. Twilight and night
-    have none, fog, rain and clouds cover it.
+    """Share () of the photographed sunlight that is left under a weather code (6,); 1 at code 0. Twilight and night
+    have none; fog, rain, snow and clouds cover it.
     """
     clear = low_sun_share(weather[Weather.FOG], weather[Weather.RAIN], weather[Weather.OVERCAST])
+    clear = clear * (1.0 - weather[Weather.SNOW])
     return clear * (1.0 - weather[Weather.TIME].square()) * (1.0 - weather[Weather.NIGHT])
 
 

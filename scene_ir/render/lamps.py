@@ -179,8 +179,8 @@ def draw_lamps(
     xy, mirror_xy = (places.reshape(-1, 2)[index] for places in (xy, mirror_xy))
     depth, facing, seen = (values.reshape(-1)[index] for values in (depth, facing, seen))
     front = index % 4 < 2
-    night = -torch.expm1(-model.NIGHTFALL * weather[Weather.NIGHT])
-    exposure = model.LAMP_BY_DAY + (1.0 - model.LAMP_BY_DAY) * night
+    longer = -torch.expm1(-(weather.new_tensor(model.LAMP_EXPOSURE) * weather).sum())
+    exposure = model.LAMP_BY_DAY + (1.0 - model.LAMP_BY_DAY) * longer
     extinction = (
         model.FOG_EXTINCTION_PER_M * weather[Weather.FOG] + model.RAIN_EXTINCTION_PER_M * weather[Weather.RAIN]
     )

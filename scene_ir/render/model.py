@@ -180,19 +180,19 @@ CLOSED_SKY_RADIUS, CLOSED_SKY_EDGE = 0.02, 2e-3
 """
 OVERCAST = 0.85
 """Weight of the picture under a closed cover at overcast 1."""
-OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.55, 0.88
+OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.70, 0.88
 """Remaining colour and contrast."""
 OVERCAST_FROM, OVERCAST_TO = 0.42, 0.42
 """Display value about which contrast shrinks, and its value afterwards."""
-COVER_AIR, COVER_LIGHT, COVER_STRUCTURE = 0.55, 0.36, 0.15
+COVER_AIR, COVER_LIGHT, COVER_STRUCTURE = 0.45, 0.62, 0.15
 """The cloud cover: share of the grey airlight, light of its own, and remaining structure of the sky."""
 OVERCAST_AIR = 0.9
 """Brightness of the airlight under it, relative to the grey one."""
-DARKENING = (0.42, 0.36, 0.26)
+DARKENING = (0.36, 0.32, 0.24)
 """Optical depth of red, green and blue at time code 1 in display values, after the camera's exposure: the end of civil
 twilight, bluer and somewhat darker, as a dashcam exposes longer.
 """
-TWILIGHT_SKY = (0.45, 0.42, 0.38)
+TWILIGHT_SKY = (0.62, 0.48, 0.26)
 """What it adds to the sky's gain: the glow of twilight lights the sky more than the ground."""
 WARMTH = (0.70, 0.12, -0.42)
 """What dusk, at half the time code, adds to red, green and blue."""
@@ -235,7 +235,7 @@ FLAKE_DRIVE_M, FLAKE_FALL_M, FLAKE_FOCAL = 0.06, 0.012, 0.7
 """Way of the camera and of flakes during the exposure; focal length, in widths of the picture."""
 FOG_EXTINCTION_PER_M = 0.03
 """Extinction at fog code 1: a meteorological visibility of about 130 m (Koschmieder: 3.9 / extinction)."""
-HAZE_GREY = 0.8
+HAZE_GREY = 1.0
 """How far fog 1 or rain 1 removes the airlight's colour: drops scatter all colours alike."""
 VEIL_BEND = 0.05
 """Display value about which the root that converts light to display values bends, so that its slope stays finite
@@ -309,8 +309,10 @@ LAMP_STRETCH = (1.5, 0.7)
 """Width and height of a lamp, relative to its radius."""
 BRAKE_LAMP, LAMP_BEND = 2.5, 6.0
 """Light of a brake lamp, relative to a tail lamp's; how sharply lamps code 0 separates off from braking."""
-LAMP_BY_DAY = 0.12
-"""The same by daylight, where the exposure is shorter."""
+LAMP_BY_DAY, LAMP_EXPOSURE = 0.12, (0.25, 0.3, 1.2, 0.1, 4.0, 0.2)
+"""The same by daylight, where the exposure is shorter; rates at which fog, rain, time, overcast, night and snow make it
+longer.
+"""
 LAMP_RADIUS_M, LAMP_LEAST_PX = 0.065, 0.6
 """Radius of a lamp, as the standard deviation of a Gaussian; least such width in the picture."""
 LAMP_FACES = (-0.05, 0.35)
