@@ -180,13 +180,13 @@ CLOSED_SKY_RADIUS, CLOSED_SKY_EDGE = 0.02, 2e-3
 """
 OVERCAST = 0.85
 """Weight of the picture under a closed cover at overcast 1."""
-OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.70, 0.88
+OVERCAST_COLOUR, OVERCAST_CONTRAST = 0.70, 0.94
 """Remaining colour and contrast."""
 OVERCAST_FROM, OVERCAST_TO = 0.42, 0.42
 """Display value about which contrast shrinks, and its value afterwards."""
 COVER_AIR, COVER_LIGHT, COVER_STRUCTURE = 0.45, 0.62, 0.15
 """The cloud cover: share of the grey airlight, light of its own, and remaining structure of the sky."""
-OVERCAST_AIR = 0.9
+OVERCAST_AIR = 1.05
 """Brightness of the airlight under it, relative to the grey one."""
 DARKENING = (0.36, 0.32, 0.24)
 """Optical depth of red, green and blue at time code 1 in display values, after the camera's exposure: the end of civil
@@ -201,7 +201,7 @@ DUSK_ENDS, DIMMING, DIMMING_ENDS = 3.5, 0.25, 2.0
 """
 DAMP = 0.9
 """Weight of the wet picture at rain 1."""
-DAMP_LIGHT, DAMP_COLOUR = 1.0, 0.75
+DAMP_LIGHT, DAMP_COLOUR = 0.97, 0.9
 """Remaining light and colour in it."""
 WET_ROAD = 0.60
 """Remaining light of a wet road's own colour."""
@@ -215,9 +215,9 @@ MIRROR_ROWS, MIRROR_REACH, MIRROR_SLACK = 180, 0.05, 0.05
 """Rows of the mirrored picture; share of them over which the road smears it, twice; slack of the search for what a ray
 meets, relative to its slope.
 """
-RAIN_EXTINCTION_PER_M = 0.006
+RAIN_EXTINCTION_PER_M = 0.003
 """Haze of strong rain at rain code 1."""
-RAIN_AIR = 0.8
+RAIN_AIR = 1.0
 """Brightness of that haze, relative to the airlight."""
 STREAKS = 0.06
 """Opacity of the streaks of rain 1."""
@@ -248,7 +248,7 @@ HAZE_CAP_M = 300.0
 
 NIGHTFALL = 4.0
 """Rate at which the share of night grows with its code: light falls by about equal factors."""
-STREET_RGB, STREET_BASE = (0.26, 0.19, 0.12), 0.25
+STREET_RGB, STREET_BASE = (0.34, 0.25, 0.16), 0.08
 """Light of street lamps relative to daylight, after the camera's exposure, in the middle of their pools; its share
 between them.
 """
@@ -264,11 +264,17 @@ each side, and of the farthest.
 """
 STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 5.0
 """Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
+HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (14.0, 200.0, 6.0), (6.0, 14.0), (2.2, 5.5)
+"""Lamps at houses and crossings: first and last distance along the street and that between two; distance from the
+camera's path; height.
+"""
+HOUSE_LAMP_RGB = ((1.0, 0.80, 0.50), (1.0, 0.95, 0.85), (0.9, 0.97, 1.0), (0.15, 0.95, 0.55), (1.0, 0.12, 0.08))
+"""Their colours: lamps, windows, signs, traffic lights."""
 GLOW_RGB = (0.0095, 0.0070, 0.0054)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6
 """Share of the picture's height over which that glow falls by a factor e."""
-HEAD_RGB, HEAD_FAR_M = (0.60, 0.51, 0.40), 16.0
+HEAD_RGB, HEAD_FAR_M = (0.75, 0.64, 0.50), 18.0
 """Light of the own headlamps, relative to daylight, on what is near; distance at which it has fallen to half."""
 SUN_SOFTENED = 1.0
 """Compression of daylight before street lamps replace it: sunlit surfaces come closer to those in the shade."""
@@ -292,7 +298,7 @@ GLARE_FOG, GLARE_RAIN = 3.0, 1.5
 """Relative growth of glare at fog 1 and rain 1."""
 CORNER = 0.45
 """Loss of light at the picture's corners, with the lens wide open."""
-NOISE, NOISE_LEVEL = 0.0025, 0.012
+NOISE, NOISE_LEVEL = 0.0012, 0.012
 """Standard deviation of the noise at black, and its growth with the display value."""
 NIGHT_BEND = 0.02
 """Display value about which the root that converts night's light to display values bends."""
@@ -301,7 +307,7 @@ NIGHT_BEND = 0.02
 
 LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0, 1.2)
 """Rates at which fog, rain, time, overcast, night and snow make drivers switch on their lamps."""
-TAIL_LAMP_RGB, HEADLAMP_RGB = (2.4, 0.10, 0.06), (8.0, 7.2, 6.0)
+TAIL_LAMP_RGB, HEADLAMP_RGB = (3.2, 0.12, 0.08), (8.0, 7.2, 6.0)
 """Light of a lamp that faces the camera by night; white is 1."""
 TAIL_CORE = 0.12
 """Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
@@ -313,11 +319,11 @@ LAMP_BY_DAY, LAMP_EXPOSURE = 0.12, (0.25, 0.3, 1.2, 0.1, 4.0, 0.2)
 """The same by daylight, where the exposure is shorter; rates at which fog, rain, time, overcast, night and snow make it
 longer.
 """
-LAMP_RADIUS_M, LAMP_LEAST_PX = 0.065, 0.6
+LAMP_RADIUS_M, LAMP_LEAST_PX = 0.08, 0.6
 """Radius of a lamp, as the standard deviation of a Gaussian; least such width in the picture."""
 LAMP_FACES = (-0.05, 0.35)
 """Cosine of a lamp's axis to the direction to the camera from which it shows, and shows fully."""
-HEADLAMP_WIDE = 0.06
+HEADLAMP_WIDE = 0.15
 """Share of a headlamp's light outside of its beam."""
 STREAK, STREAK_SHARE = (0.05, 0.0015), 0.02
 """Widths of the streak across a lamp, in heights of the picture, and its share of the light."""

@@ -40,8 +40,10 @@ class NightMaps:
 
 
 @torch.no_grad()
-def compute_night_maps(scene: SceneIR) -> NightMaps:
-    """Maps of a scene, by its background, depth, sky and camera."""
+def compute_night_maps(scene: SceneIR, background: Tensor) -> NightMaps:
+    """Maps of a scene, by its depth, sky and camera, and its background without direct sun (3, H, W), as far as that is
+    known.
+    """
     height, width = scene.camera.height, scene.camera.width
     like = scene.background
     ground, matrix = (
@@ -57,7 +59,7 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     tangent = ((columns - matrix[0, 2]) / matrix[0, 0]).numpy()
     sky, leaves = (getattr(scene.environment, name).double().cpu().numpy() for name in ("sky", "foliage_map"))
     depth = scene.depth.double().cpu().numpy()
-    rgb = scene.background.permute(1, 2, 0).double().cpu().numpy()
+    rgb = background.permute(1, 2, 0).double().cpu().numpy()
     aim = model.HEAD_SIDE + (1 - model.HEAD_SIDE) * np.exp(-np.square(tangent / model.HEAD_AIM))
     aim = aim * (1 + model.RETRO * _signs(rgb, sky, leaves))
     above_m = height_above_ground(scene.depth, scene.environment.ground, scene.camera.matrix).cpu().numpy()
@@ -65,18 +67,19 @@ def compute_night_maps(scene: SceneIR) -> NightMaps:
     road = scene.environment.road.double().cpu().numpy()[..., None]
     level = float((road * np.square(rgb)).sum() / max(3 * float(road.sum()), 1.0)) or model.ROAD_LIGHT
     exposure = float(np.clip(model.ROAD_LIGHT / level, *model.EXPOSURE))
-    surface = _surface_share(rgb, sky, leaves)
-    aim, street = exposure * surface * aim, surface * street
+    missed = _missed_sky(rgb, sky, leaves)
+    aim, street = exposure * (1 - missed) * aim, (1 - missed) * street
     lit = find_lit(rgb, np.maximum(sky, leaves)) * _ramp(above_m, *model.LIT_HEIGHT_M)
     horizon = float(matrix[1, 2] / height)
     glow = np.exp(-np.maximum(horizon - rows.numpy() / height, 0.0) / model.GLOW_HEIGHT)
-    lamps = _street_lamps(scene, depth, camera_m)
+    lamps = _street_lamps(scene, depth)
     shining = (lit * np.square(rgb).max(axis=2))[..., None] * np.square(rgb) * model.LIT_GAIN + lamps
     glare = sum(share * _blur(shining, sigma * height) for sigma, share in model.GLARE)
     radius = np.square(columns.numpy() / width - 0.5) + np.square(rows.numpy() / height - 0.5)
     planes = [rise.numpy(), aim, np.where(sky > 0.5, glow, street), lit, 2 * model.CORNER * radius]
     fixed = torch.from_numpy(np.stack([*planes])).to(like)
-    glare = torch.from_numpy(np.ascontiguousarray(np.moveaxis(glare + lamps, 2, 0))).to(like)
+    glare = glare + lamps + ((1 - sky) * missed * glow)[..., None] * np.array(model.GLOW_RGB)
+    glare = torch.from_numpy(np.ascontiguousarray(np.moveaxis(glare, 2, 0))).to(like)
     return NightMaps(
         torch.cat([fixed, _noise_field(height, width).to(like), glare]), camera_m, measure_daylight(scene)
     )
@@ -159,14 +162,14 @@ def find_lit(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
     return _ramp(value, *model.LIT_LEVEL) * small * (1 - near_sky)
 
 
-def _surface_share(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
-    """How far (H, W) a pixel shows what lamps can light: day's sky shows in the gaps of leaves, and pale around where
-    its map ends.
+def _missed_sky(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
+    """How far (H, W) a pixel shows day's sky, though the map of the sky does not have it: in the gaps of leaves, and
+    where that map ends.
     """
     reach = max(3, rgb.shape[0] // 5)
     around = cv2.dilate((sky > 0.5).astype(np.float64), np.ones((reach, reach)))
     grey = rgb.mean(axis=2)
-    return 1 - 0.9 * np.maximum(leaves * _ramp(grey, 0.35, 0.65), around * _ramp(grey, 0.6, 0.8))
+    return np.maximum(leaves * _ramp(grey, 0.35, 0.65), around * _ramp(grey, 0.5, 0.75))
 
 
 def _street_light(aside_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
@@ -185,24 +188,37 @@ def _street_posts() -> list[tuple[float, float]]:
     return list(zip(sides.tolist(), (model.STREET_EVERY_M * steps).tolist(), strict=True))
 
 
-def _street_lamps(scene: SceneIR, depth_m: np.ndarray, camera_m: float) -> np.ndarray:
-    """Images (H, W, 3) of the street lamps that nothing hides, as light."""
+def _other_lamps() -> list[tuple[float, float, float, tuple[float, float, float]]]:
+    """Places (x, height, z) m and colours of lamps at houses and crossings; the same in all scenes."""
+    generator = np.random.default_rng(19390102)
+    lamps = []
+    for z in np.arange(*model.HOUSE_LAMPS_M):
+        x = float(generator.choice([-1, 1]) * generator.uniform(*model.HOUSE_ASIDE_M))
+        colour = model.HOUSE_LAMP_RGB[int(generator.integers(len(model.HOUSE_LAMP_RGB)))]
+        lamps.append((x, float(generator.uniform(*model.HOUSE_LAMP_HEIGHT_M)), float(z), colour))
+    return lamps
+
+
+def _street_lamps(scene: SceneIR, depth_m: np.ndarray) -> np.ndarray:
+    """Images (H, W, 3) of the lamps along the street that nothing hides, as light."""
     height, width = depth_m.shape
     out = np.zeros((height, width, 3))
     ground = scene.environment.ground.double().cpu().numpy()
     matrix = scene.camera.matrix.double().cpu().numpy()
     down = -ground[:3]
-    for x, z in _street_posts():
+    posts = [(x, model.STREET_LAMP_M, z, model.STREET_LAMP_RGB) for x, z in _street_posts()]
+    for x, high, z, colour in posts + _other_lamps():
         # on the ground below, then up
         foot = np.array([x, (-ground[3] - ground[0] * x - ground[2] * z) / ground[1], z])
-        u, v, w = matrix @ np.append(foot - down * model.STREET_LAMP_M, 1.0)
+        u, v, w = matrix @ np.append(foot - down * high, 1.0)
         column, row = round(u / w), round(v / w)
         if not (0 <= column < width and 0 <= row < height) or depth_m[row, column] < z:
             continue
-        radius = max(model.STREET_LAMP_AT_10_M * 10 / z * height / 720, 0.35)
+        size = model.STREET_LAMP_AT_10_M * high / model.STREET_LAMP_M
+        radius = max(size * 10 / z * height / 720, 0.35)
         xs, ys = np.arange(width) - u / w, np.arange(height) - v / w
         spot = np.exp(-0.5 * np.square(ys / radius))[:, None] * np.exp(-0.5 * np.square(xs / radius))
-        out += spot[..., None] * 1.5 * np.array(model.STREET_LAMP_RGB)
+        out += spot[..., None] * 1.5 * np.array(colour)
     return out
 
 

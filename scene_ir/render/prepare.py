@@ -466,7 +466,9 @@ class PreparedScene:
     @cached_property
     def night_maps(self) -> NightMaps:
         """Result of `night.compute_night_maps`; computed on first use."""
-        return compute_night_maps(self.scene)
+        gain = self.closed_sky_gain
+        shaded = self.scene.background if gain is None else self.scene.background * (1.0 + gain)
+        return compute_night_maps(self.scene, shaded.clamp(0.0, 1.0))
 
     @cached_property
     @torch.no_grad()

@@ -143,7 +143,7 @@ def test_small_bright_places_above_the_ground_shine_on_and_patches_of_sun_do_not
 
 
 def test_maps_know_the_ground_and_the_own_lane(photographed: SceneIR) -> None:
-    found = night.compute_night_maps(photographed)
+    found = night.compute_night_maps(photographed, photographed.background)
     maps = found.maps
     height, width = photographed.depth.shape
     assert tuple(maps.shape) == (channels.NIGHT_MAPS, height, width)
