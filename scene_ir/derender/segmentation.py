@@ -21,6 +21,7 @@ from torch import Tensor
 from scene_ir.derender import unet
 from scene_ir.derender.unet import UNet, compute_elevation
 from scene_ir.errors import RangeError, ShapeError
+from scene_ir.render.model import LUMA
 from scene_ir.types import Camera, Frame
 from scene_ir.weights import load_frozen
 
@@ -96,6 +97,10 @@ belong to no map."""
 _TERRAIN = "terrain"
 """Virtual KITTI's name of all ground except roads: the network decides whether it is grass."""
 REQUIRED_MAPS = ("sky", "foliage", "road")
+_SURE_SKY, _UNSURE_SKY, _SKY_AROUND, _SKY_DARKER = 0.9, 0.12, 0.1, (-0.15, -0.06)
+"""Share from which a pixel is sky for certain, and from which one may be; the least share of such sky around it; how
+much darker than it sky may be.
+"""
 """Maps that a segmenter's classes must fill."""
 _GROUND_ENDS, _SKY_ENDS = 0.02, -0.012
 """Sines of the elevation above which there is no ground, and below which there is no sky. Hills and the plane's
@@ -193,7 +198,7 @@ def segment_photograph(
     elevation = cv2.resize(elevation, (width, height), interpolation=cv2.INTER_LINEAR)
     below = np.clip((_GROUND_ENDS - elevation) / _END_WIDTH, 0, 1)
     above = np.clip((elevation - _SKY_ENDS) / _END_WIDTH, 0, 1)
-    sky = maps.sky * above
+    sky = _complete_sky(maps.sky, image) * above
     return replace(
         maps,
         sky=sky,
@@ -201,6 +206,20 @@ def segment_photograph(
         road=maps.road * below,
         ground=maps.ground * below,
     )
+
+
+def _complete_sky(sky: Array, image: Array) -> Array:
+    """The map (H, W) of the sky with its gaps filled: the network is unsure of clouds around a pole, while what stands
+    before a sky is darker than it.
+    """
+    reach = max(3, image.shape[0] // 4)
+    luma = image @ np.array(LUMA, np.float32)
+    sure = (sky > _SURE_SKY).astype(np.float32)
+    weight = cv2.blur(sure, (reach, reach))
+    around = cv2.blur(luma * sure, (reach, reach)) / np.maximum(weight, 1e-3)
+    bright = np.clip((luma - around - _SKY_DARKER[0]) / (_SKY_DARKER[1] - _SKY_DARKER[0]), 0, 1)
+    possible = np.clip(sky / _UNSURE_SKY, 0, 1) * (weight > _SKY_AROUND)
+    return np.maximum(sky, possible * bright)
 
 
 def apply_frame_classes(frame: Frame, estimated: Segmentation) -> Segmentation:

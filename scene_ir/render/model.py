@@ -270,6 +270,8 @@ camera's path; height.
 """
 HOUSE_LAMP_RGB = ((1.0, 0.80, 0.50), (1.0, 0.95, 0.85), (0.9, 0.97, 1.0), (0.15, 0.95, 0.55), (1.0, 0.12, 0.08))
 """Their colours: lamps, windows, signs, traffic lights."""
+LAMP_SHOWS = 0.75
+"""Depth, relative to a lamp's, up to which a surface hides it: depths of a street's sides are estimates."""
 GLOW_RGB = (0.0095, 0.0070, 0.0054)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6

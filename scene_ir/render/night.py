@@ -212,7 +212,7 @@ def _street_lamps(scene: SceneIR, depth_m: np.ndarray) -> np.ndarray:
         foot = np.array([x, (-ground[3] - ground[0] * x - ground[2] * z) / ground[1], z])
         u, v, w = matrix @ np.append(foot - down * high, 1.0)
         column, row = round(u / w), round(v / w)
-        if not (0 <= column < width and 0 <= row < height) or depth_m[row, column] < z:
+        if not (0 <= column < width and 0 <= row < height) or depth_m[row, column] < model.LAMP_SHOWS * z:
             continue
         size = model.STREET_LAMP_AT_10_M * high / model.STREET_LAMP_M
         radius = max(size * 10 / z * height / 720, 0.35)

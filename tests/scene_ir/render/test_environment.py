@@ -99,8 +99,15 @@ def test_twilight_is_dark_and_blue_sunset_is_warm() -> None:
     image, twilight = _weather(_code(TIME, 1.0))
     _, sunset = _weather(_code(TIME, 0.4))
     mean, dark, warm = (x.flatten(1).mean(dim=1) for x in (image, twilight, sunset))
-    assert 0.4 * float(mean.mean()) < float(dark.mean()) < 0.5 * float(mean.mean())
-    assert float(dark[2] / dark[0]) > 1.3 * float(mean[2] / mean[0])
+    assert 0.65 * float(mean.mean()) < float(dark.mean()) < 0.9 * float(mean.mean())
+    # the sky, the rows above 10, still glows
+    gains = [
+        float((after / before).mean())
+        for before, after in ((image[:, :8], twilight[:, :8]), (image[:, 12:], twilight[:, 12:]))
+    ]
+    assert gains[0] > 1.2 * gains[1]
+    ground = [x[:, 12:].flatten(1).mean(dim=1) for x in (image, twilight)]
+    assert float(ground[1][2] / ground[1][0]) > 1.08 * float(ground[0][2] / ground[0][0])
     assert float(warm[0] / warm[2]) > 1.1 * float(mean[0] / mean[2])
 
 
@@ -117,7 +124,7 @@ def test_overcast_and_rain_reduce_colour_and_contrast() -> None:
         image, after = _weather(_code(index, 1.0))
         ground = slice(12, 24)
         before, now = ((x.amax(dim=0) - x.amin(dim=0))[ground].mean() for x in (image, after))
-        assert float(now) < 0.8 * float(before)
+        assert float(now) < 0.85 * float(before)
         assert float(after[:, ground].std()) < float(image[:, ground].std())
 
 
@@ -182,4 +189,4 @@ def test_sky_colour_is_photographed_or_default() -> None:
 
 def test_shadows_soften_in_bad_weather_only() -> None:
     assert float(env.shadow_softening(torch.zeros(WEATHER_DIM))) == 1.0
-    assert float(env.shadow_softening(torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0]))) < 0.6
+    assert float(env.shadow_softening(torch.eye(WEATHER_DIM)[OVERCAST])) < 0.6
