@@ -68,7 +68,7 @@ RAIN_UNDER_CLEAR_SKY = 0.5
 DAYLIGHT_LX, TWILIGHT_LX = 15_000.0, 3.4
 """Illuminance in the shade at noon, and at the end of civil twilight (RCA Electro-Optics Handbook, 1974)."""
 EXTINCTION_PER_M = (0.03, 0.006, 0.0075)
-"""Extinction of the codes fog 1 and rain 1."""
+"""Extinction of the codes fog 1, rain 1 and snow 1."""
 DIMMING = 0.8
 """Exponent of the dimming of display values at time 1."""
 AIRLIGHT = 0.82

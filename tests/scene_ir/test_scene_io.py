@@ -13,7 +13,7 @@ import torch
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene
-from scene_ir.types import Camera, Crop, Environment, Labels, Mesh, Objects, SceneIR, Source
+from scene_ir.types import WEATHER_DIM, Camera, Crop, Environment, Labels, Mesh, Objects, SceneIR, Source
 
 H, W = 12, 20
 
@@ -173,11 +173,13 @@ def test_perturbed_tensors_are_saved_without_their_gradient(tmp_path: Path) -> N
     assert not loaded.objects.yaw.requires_grad
 
 
-def test_a_scene_with_the_codes_of_daylight_is_night_0(tmp_path: Path) -> None:
+@pytest.mark.parametrize("codes", [[0.1, 0.2, 0.3, 0.4], [0.1, 0.2, 0.3, 0.4, 0.5]])
+def test_a_scene_saved_before_night_or_snow_has_none(tmp_path: Path, codes: list[float]) -> None:
     scene = rich_scene()
     save_scene(scene, tmp_path / "scene")
-    edit("environment", "weather", value=[0.1, 0.2, 0.3, 0.4])(tmp_path / "scene")
-    assert load_scene(tmp_path / "scene").environment.weather.tolist() == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.0])
+    edit("environment", "weather", value=codes)(tmp_path / "scene")
+    expected = (codes + [0.0] * WEATHER_DIM)[:WEATHER_DIM]
+    assert load_scene(tmp_path / "scene").environment.weather.tolist() == pytest.approx(expected)
 
 
 def test_eight_bit_photograph_is_a_png_and_others_are_not(tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ def test_a_street_is_longer_along_than_across(street):
     assert along_m == pytest.approx([float(away_m[0]), float(away_m[1]), budget.translate * 1.6, 4.0])
     assert across_m == pytest.approx([1.0] * 4)
     # All else goes as far as the paper's.
-    papers = ParameterSpace(scene, PAPER_PARAMETERS, Budget(night=1.0))
+    papers = ParameterSpace(scene, PAPER_PARAMETERS, Budget(night=1.0, snow=1.0))
     size = space.blocks.get(Parameter.SIZE)
     assert space.upper[size].tolist() == pytest.approx([0.1] * 4)
     assert space.upper[size.stop :].tolist() == [1.0] * 7  # the sun's and the lamps'
@@ -161,7 +161,7 @@ def test_a_street_is_longer_along_than_across(street):
     assert not bool(wider[: where.start].any() or wider[where.stop :].any())
 
 
-def test_a_street_has_nights_and_its_older_runs_have_none(street):
+def test_a_street_has_nights_and_snow_and_its_older_runs_have_none(street):
     names = [f"weather.{name}" for name in ("fog", "rain", "time_of_day", "overcast")]
     budget = parse_budget("street")
     assert (budget.night, parse_budget("street,night=0.5").night, parse_budget("street,night=0").night) == (
@@ -169,9 +169,11 @@ def test_a_street_has_nights_and_its_older_runs_have_none(street):
         0.5,
         0,
     )
-    assert budget_for_coordinates(budget, [*names, "weather.night"]) == budget
+    assert (budget.snow, parse_budget("street,snow=0.5").snow, PRESETS["paper"].snow) == (1, 0.5, 0)
+    assert budget_for_coordinates(budget, [*names, "weather.night", "weather.snow"]) == budget
+    assert budget_for_coordinates(budget, [*names, "weather.night"]) == parse_budget("street,snow=0")
     older = budget_for_coordinates(budget, names)
-    assert older == parse_budget("street,night=0")
+    assert older == parse_budget("street,night=0,snow=0")
     assert parse_budget(format_budget(older)) == older
     space = ParameterSpace(street(), ("weather",), older)
     assert [space.name(i) for i in range(space.dim)] == names

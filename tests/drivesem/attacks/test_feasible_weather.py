@@ -13,40 +13,41 @@ from drivesem.attacks.feasibility_check import ChangeLimits, check_scene
 from drivesem.attacks.feasible.constraints import CODE_SUM_LIMITS, CODE_SUMS, FeasibilityLimits
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.space import Budget, ParameterSpace
+from scene_ir.types import WEATHER_DIM
 
 EXACT = 2e-3
 """Of codes: how near the general minimiser comes to the nearest point."""
 ROUNDING = 2e-6
-POINT = st.lists(st.floats(-0.5, 2.0), min_size=5, max_size=5)
-CODE = st.lists(st.floats(0, 1), min_size=5, max_size=5)
-LIMITS = ChangeLimits(night=1.0)
+POINT = st.lists(st.floats(-0.5, 2.0), min_size=WEATHER_DIM, max_size=WEATHER_DIM)
+CODE = st.lists(st.floats(0, 1), min_size=WEATHER_DIM, max_size=WEATHER_DIM)
+LIMITS = ChangeLimits(night=1.0, snow=1.0)
 lenient = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-def _space(street, start=(0.0,) * 5, **budget) -> ParameterSpace:
+def _space(street, start=(0.0,) * WEATHER_DIM, **budget) -> ParameterSpace:
     scene = street(positions_xz=()).with_environment(weather=torch.tensor(start, dtype=torch.float32))
-    return ParameterSpace(scene, ("weather",), Budget(**{"night": 1.0} | budget))
+    return ParameterSpace(scene, ("weather",), Budget(**{"night": 1.0, "snow": 1.0} | budget))
 
 
-def _projected(street, theta, start=(0.0,) * 5, **budget) -> np.ndarray:
+def _projected(street, theta, start=(0.0,) * WEATHER_DIM, **budget) -> np.ndarray:
     space = _space(street, start, **budget)
     return FeasibleSet(space).project(torch.tensor(theta, dtype=torch.float32)).theta.double().numpy()
 
 
 @lenient
 @given(point=POINT)
-@example(point=[1.0, 1.0, 1.0, 1.0, 1.0])
-@example(point=[0.0, 1.0, 0.0, 0.0, 0.0])
-@example(point=[2.0, 2.0, -0.5, -0.5, 0.0])
+@example(point=[1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+@example(point=[0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+@example(point=[2.0, 2.0, -0.5, -0.5, 0.0, 0.5])
 def test_the_projection_is_the_nearest_point(street, point):
     found, requested = _projected(street, point), np.array(point)
     assert (CODE_SUMS @ found <= CODE_SUM_LIMITS + ROUNDING).all()
     assert ((found >= 0) & (found <= 1)).all()
     least = minimize(
         lambda code: ((code - requested) ** 2).sum(),
-        np.full(5, 0.2),
+        np.full(WEATHER_DIM, 0.1),
         jac=lambda code: 2 * (code - requested),
-        bounds=[(0, 1)] * 5,
+        bounds=[(0, 1)] * WEATHER_DIM,
         constraints=LinearConstraint(CODE_SUMS, -np.inf, CODE_SUM_LIMITS),
         method="SLSQP",
     )
@@ -74,7 +75,13 @@ def test_what_goes_together_stays_to_the_bit(street, code):
 
 
 @pytest.mark.parametrize(
-    "code", [*torch.eye(5)[[0, 2, 3, 4]].tolist(), [0, 1, 0, 0.5, 1], [0.5, 0.5, 0, 0, 0], [0] * 5]
+    "code",
+    [
+        *torch.eye(WEATHER_DIM)[[0, 2, 3, 4, 5]].tolist(),
+        [0, 1, 0, 0.5, 1, 0],
+        [0.25, 0.5, 0, 0, 0, 0.25],
+        [0] * WEATHER_DIM,
+    ],
 )
 def test_each_code_reaches_its_end(street, code):
     assert _projected(street, code) == pytest.approx(np.array(code), abs=0)
@@ -83,12 +90,13 @@ def test_each_code_reaches_its_end(street, code):
 @pytest.mark.parametrize(
     ("code", "names"),
     [
-        ([1.0, 1.0, 0.0, 1.0, 0.0], ("weather: fog in rain or snow",)),
-        ([0.0, 1.0, 0.0, 0.0, 0.0], ("weather: rain without cover",)),
-        ([0.0, 0.0, 1.0, 1.0, 0.0], ("weather: dark",)),
-        ([0.0, 0.0, 0.6, 0.0, 0.6], ("weather: dusk at night",)),
+        ([1.0, 1.0, 0.0, 1.0, 0.0, 0.0], ("weather: fog in rain or snow",)),
+        ([0.0, 0.6, 0.0, 0.6, 0.0, 0.6], ("weather: fog in rain or snow",)),
+        ([0.0, 1.0, 0.0, 0.0, 0.0, 0.0], ("weather: rain without cover",)),
+        ([0.0, 0.0, 1.0, 1.0, 0.0, 0.0], ("weather: dark",)),
+        ([0.0, 0.0, 0.6, 0.0, 0.6, 0.0], ("weather: dusk at night",)),
         (
-            [1.0, 1.0, 1.0, 0.2, 0.0],
+            [1.0, 1.0, 1.0, 0.2, 0.0, 0.0],
             ("weather: fog in rain or snow", "weather: rain without cover", "weather: dark"),
         ),
     ],
@@ -101,9 +109,9 @@ def test_what_holds_back_is_named(street, code, names):
 
 def test_a_code_beyond_its_budget_is_named_as_before(street):
     space = _space(street, weather=0.4)
-    found = FeasibleSet(space).project(torch.tensor([0.6, 0.1, 0.0, 0.0, 0.0]))
+    found = FeasibleSet(space).project(torch.tensor([0.6, 0.1, 0.0, 0.0, 0.0, 0.0]))
     assert found.active == ("weather.fog: bounds",)
-    assert found.theta.tolist() == pytest.approx([0.4, 0.1, 0.0, 0.0, 0.0])
+    assert found.theta.tolist() == pytest.approx([0.4, 0.1, 0.0, 0.0, 0.0, 0.0])
 
 
 @lenient
@@ -136,7 +144,7 @@ def test_projection_and_check_agree_on_weather(street, code):
 
 
 def test_bounding_together_is_a_limit(street):
-    space, everything = _space(street), torch.ones(5)
+    space, everything = _space(street), torch.ones(WEATHER_DIM)
     free = FeasibleSet(space, FeasibilityLimits(joint_weather=False)).project(everything)
     assert torch.equal(free.theta, everything)
     assert free.active == ()

@@ -19,7 +19,7 @@ from drivesem.attacks.space import (
 from scene_ir.errors import FormatError, RangeError, ShapeError
 
 ALL = tuple(Parameter)
-WIDE = Budget(size=0.1, sun=1.0, night=1.0, lamps=1.0)
+WIDE = Budget(size=0.1, sun=1.0, night=1.0, snow=1.0, lamps=1.0)
 
 
 def test_parsed_parameters_are_in_thetas_order():
@@ -81,7 +81,7 @@ def test_codes_end_at_the_same_value_wherever_they_start(street):
     assert space.lower[20:].tolist() == [-0.25, 0.0, -1.0, -0.5]
     moved = space.apply(scene, space.upper)
     assert moved.objects.texture_code.tolist() == [[1.0] * 5] * 4
-    assert moved.environment.weather.tolist() == [1.0] * 4 + [0.0]
+    assert moved.environment.weather.tolist() == [1.0] * 4 + [0.0, 0.0]
 
 
 def test_night_is_a_fifth_code_where_the_budget_has_one(street):
@@ -90,8 +90,17 @@ def test_night_is_a_fifth_code_where_the_budget_has_one(street):
     assert (papers.dim, wider.dim, wider.name(4)) == (4, 5, "weather.night")
     assert wider.upper.tolist() == pytest.approx([0.8] * 4 + [0.25])
     assert ParameterSpace(scene, ("weather",), Budget(night=1.0, weather=0.8)).upper[4] == pytest.approx(0.55)
-    assert papers.apply(scene, papers.upper).environment.weather.tolist() == pytest.approx([0.8] * 4 + [0.25])
-    assert wider.apply(scene, wider.upper).environment.weather.tolist() == pytest.approx([0.8] * 4 + [0.5])
+    assert papers.apply(scene, papers.upper).environment.weather.tolist() == pytest.approx([0.8] * 4 + [0.25, 0.0])
+    assert wider.apply(scene, wider.upper).environment.weather.tolist() == pytest.approx([0.8] * 4 + [0.5, 0.0])
+
+
+def test_snow_is_a_sixth_code_where_the_budget_has_one(street):
+    scene = street()
+    both, alone = (ParameterSpace(scene, ("weather",), Budget(night=n, snow=0.6)) for n in (1.0, 0.0))
+    assert (both.dim, alone.dim, both.name(5)) == (6, 6, "weather.snow")
+    assert both.upper.tolist() == pytest.approx([1.0] * 5 + [0.6])
+    assert alone.upper.tolist() == pytest.approx([1.0] * 4 + [0.0, 0.6])
+    assert alone.apply(scene, alone.upper).environment.weather.tolist() == pytest.approx([1.0] * 4 + [0.0, 0.6])
 
 
 def test_every_coordinate_has_a_name_a_unit_and_bounds(street):

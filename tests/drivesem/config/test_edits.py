@@ -61,10 +61,11 @@ def test_settings_of_objects(text: str, expected: dict[int | str, ObjectEdit]) -
 
 def test_settings_of_the_scene() -> None:
     assert edit_of("weather.rain=0.4", "foliage.hue=-0.5") == FrameEdit(
-        weather=(0.0, 0.4, 0.0, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
+        weather=(0.0, 0.4, 0.0, 0.0, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
     )
-    assert edit_of("weather=fog=0.6,night=1").weather == (0.6, 0.0, 0.0, 0.0, 1.0)
-    assert edit_of("weather.rain=0.4", "weather=fog=0.6").weather == (0.6, 0.0, 0.0, 0.0, 0.0)
+    assert edit_of("weather=fog=0.6,night=1").weather == (0.6, 0.0, 0.0, 0.0, 1.0, 0.0)
+    assert edit_of("weather=snow").weather == (0.0, 0.0, 0.0, 0.0, 0.0, 0.8)
+    assert edit_of("weather.rain=0.4", "weather=fog=0.6").weather == (0.6, 0.0, 0.0, 0.0, 0.0, 0.0)
     for name, codes in WEATHER_PRESETS.items():
         assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_CODES)
 
@@ -164,14 +165,14 @@ def test_bare_numbers_of_a_file_are_in_units_of_theta() -> None:
         ("objects[-1].rotate=1deg", "objects: expected a number from 0, or all, found '-1'"),
         ("objects[two].rotate=1deg", "objects: expected a number from 0, or all, found 'two'"),
         (
-            "weather=snow",
+            "weather=hail",
             "weather: expected codes such as fog=0.6,night=1, or one of fog, rain, sunset, overcast, twilight, night, "
-            "found 'snow'",
+            "snow, found 'hail'",
         ),
-        ("weather=snow=1", "weather: snow: expected one of fog, rain, time, overcast, night"),
+        ("weather=hail=1", "weather: hail: expected one of fog, rain, time, overcast, night, snow"),
         ("weather=night=2", r"weather.night: expected a code in \[0, 1\], found 2.0"),
         ("weather=fog=0.5,night", "weather: expected codes such as"),
-        ("weather.snow=1", "weather: snow: expected one of fog, rain, time, overcast"),
+        ("weather.hail=1", "weather: hail: expected one of fog, rain, time, overcast"),
         ("weather.fog=2", r"weather.fog: expected a code in \[0, 1\], found 2.0"),
         ("foliage=autumn", "an unknown parameter"),
         ("objects.rotate=1deg", "an unknown parameter"),
@@ -229,10 +230,10 @@ def test_it_moves_as_theta_does(street: Street) -> None:
 
     change = Perturbation(
         color=rows(count, 5), translate=rows(count, 2), rotate=rows(count, 1), mesh=rows(count, SYMMETRIC_DIM),
-        weather=rows(5).abs(), foliage=rows(3),
+        weather=rows(6).abs(), foliage=rows(3),
     )  # fmt: skip
     params = ["color", "weather", "foliage", "translate", "rotate", "mesh"]
-    space = ParameterSpace(scene, params, Budget(night=1.0))
+    space = ParameterSpace(scene, params, Budget(night=1.0, snow=1.0))
     expected = space.apply(scene, space.flatten(change))
     assert change.translate is not None
     assert change.rotate is not None

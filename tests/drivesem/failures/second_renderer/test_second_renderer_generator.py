@@ -258,7 +258,7 @@ def test_paint_weather_and_foliage(plan: Plan, street_scene: SceneIR) -> None:
     )
     edit = transfer_edit(street_scene, changed, match_tracks(plan, *tracks_of(plan))).edit
     assert edit.objects[plan.actors[1].track].color == pytest.approx((-0.4, 0, 0, 0, 0))
-    assert edit.weather == pytest.approx((0.3, 0, 0.5, 0, 0))
+    assert edit.weather == pytest.approx((0.3, 0, 0.5, 0, 0, 0))
     assert edit.foliage == pytest.approx((-0.2, 0, 0.1))
 
 
@@ -268,9 +268,10 @@ def test_what_has_no_counterpart_is_named_where_it_was_changed(plan: Plan, stree
     found = transfer_edit(street_scene, changed, match_tracks(plan, None, tracks_of(plan)[1], None))
     assert found.missing == ("objects[0]: the generator's plan has no such vehicle",)
     assert list(found.edit.objects) == [tracks_of(plan)[1]]
-    by_night = street_scene.with_environment(weather=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5]))
+    by_night = street_scene.with_environment(weather=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5, 0.5]))
     assert transfer_edit(street_scene, by_night, match_tracks(plan, *tracks_of(plan))).missing == (
         "night: generated streets are drawn by daylight",
+        "snow: no snow falls in generated streets",
     )
 
 
