@@ -88,9 +88,11 @@ def _conditions(config: ConditionsConfig, console: Console) -> BenchResult:
         "half": config.half,
         "notes": notes,
         "rows": conditions.measure_rows(rows, config.bootstrap, config.seed),
+        "joint": conditions.joint_rows(rows),
         "probe": conditions.probe_rows(rows, config.bootstrap, config.seed),
     }
     if config.recall:
+        frames = [frame for frame in frames if frame.condition != conditions.JOINT]
         detected = conditions.detect_frames(config, detectors_of_recall, frames)
         hits = list(show_progress(detected, len(frames) * len(detectors_of_recall), console))
         fields["recall"] = conditions.recall_rows(hits, config.bootstrap, config.seed)

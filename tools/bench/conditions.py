@@ -26,6 +26,9 @@ import drivesem as ds
 from detectors.base import DetectorError, Predictor, predict
 from detectors.registry import SHIPPED, load_predictor
 from detectors.types import Detections
+from drivesem.attacks.budgets import PRESETS, STREET
+from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.space import Parameter, ParameterSpace
 from drivesem.attacks.targets import resolve_t_star
 from drivesem.bench.session import BenchTable, Columns
 from drivesem.config.edits import WEATHER_CODES, WEATHER_PRESETS
@@ -54,6 +57,7 @@ _DETECTOR_VEHICLES = (*VEHICLES, "van", "train")
 DRY = ("clear", "partly_cloudy", "overcast", "undefined")
 SUNNY = ("clear", "partly_cloudy")
 DAY = "day, dry"
+JOINT = "any feasible weather"
 UNDRAWN = "as photographed"
 _JPEG_QUALITY = 75
 """Of drawn pictures; finer than that of BDD100K's files, so that it hardly changes them (an undrawn day that is
@@ -103,6 +107,15 @@ CONDITIONS = (
 )
 """Conditions; one without a weather of that name has real figures only."""
 
+JOINT_TITLE = "Feasible weather outside of what 99 % of real frames in bad weather and by night have"
+JOINT_COLUMNS: Columns = {
+    "measure": ("measure", "measure"), "real_frames": ("real frames", "real"), "low": ("from", "from"),
+    "high": ("to", "to"), "drawn_frames": ("drawn frames", "drawn"), "outside": ("outside", "outside"),
+}  # fmt: skip
+JOINT_MEASURES = (
+    "frame: brightness", "frame: contrast", "frame: saturation", "frame: air a*", "frame: air b*", "boxes: contrast",
+    "boxes: saturation",
+)  # fmt: skip
 TITLE = "Drawn weather against real frames"
 COLUMNS: Columns = {
     "condition": ("condition", "condition"), "measure": ("measure", "measure"),
@@ -217,6 +230,23 @@ class ConditionSets:
                 frame = ConditionFrame(condition, True, name, frame.boxes_xyxy, read)
             yield frame
 
+    def states(self) -> Iterator[ConditionFrame]:
+        """The same days under random feasible states of all codes."""
+        for name in self.base():
+            boxes = _vehicle_boxes(self._bdd, name)
+            for k in range(self._config.states):
+                read = partial(self._draw_state, name, k, self._out / "drawn" / f"state-{k}" / f"{name}.jpg")
+                yield ConditionFrame(JOINT, True, f"{name}-{k}", boxes, read)
+
+    def _draw_state(self, name: str, k: int, path: Path) -> Picture:
+        scene = self._scene(name)
+        space = ParameterSpace(scene.ir, [Parameter.WEATHER], PRESETS[STREET])
+        generator = np.random.default_rng([self._config.seed, k, *_digest(name)])
+        # Ends of the codes' ranges are where attacks drive them.
+        wanted = generator.choice([0.0, 1.0, generator.uniform()], size=space.dim)
+        codes = FeasibleSet(space).project(torch.from_numpy(wanted).float()).theta.tolist()
+        return self._draw(name, dict(zip(WEATHER_CODES, codes, strict=False)), path)
+
     def base(self) -> list[str]:
         """Frames that weather is drawn on: sunny days of the half with judged vehicles, in the order of the hash."""
         names = sorted(self._of(("daytime",), SUNNY), key=_digest)
@@ -296,7 +326,7 @@ def collect_frames(config: ConditionsConfig) -> tuple[list[ConditionFrame], list
             frames += sets.drawn(condition.name, settings)
         elif condition.preset is not None:
             notes.append(f"{condition.name}: not drawn, there is no weather {condition.preset!r}")
-    return frames, notes
+    return [*frames, *sets.states()], notes
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,6 +402,27 @@ def measure_rows(rows: Sequence[MeasuredFrame], draws: int, seed: int) -> list[d
                 }
             table.append(line)
     return table
+
+
+def joint_rows(rows: Sequence[MeasuredFrame]) -> list[dict[str, Any]]:
+    """A line for each measure: between which values 99 % of all real frames lie, and how many states lie outside."""
+    lines = []
+    states = [row for row in rows if row.condition == JOINT]
+    for name in JOINT_MEASURES if states else ():
+        real, drawn = _values([row for row in rows if not row.drawn], name), _values(states, name)
+        low, high = np.quantile(real, [0.005, 0.995])
+        outside = int(((drawn < low) | (drawn > high)).sum())
+        lines.append(
+            {
+                "measure": name,
+                "real_frames": len(real),
+                "low": _round(float(low)),
+                "high": _round(float(high)),
+                "drawn_frames": len(drawn),
+                "outside": outside,
+            }
+        )
+    return lines
 
 
 def probe_rows(rows: Sequence[MeasuredFrame], draws: int, seed: int) -> list[dict[str, Any]]:
@@ -620,6 +671,7 @@ def tables(half: str, fields_: Mapping[str, Sequence[dict[str, Any]]]) -> list[B
     of_half = "all real frames" if half == "all" else f"half {half}"
     parts = (
         ("rows", TITLE, COLUMNS),
+        ("joint", JOINT_TITLE, JOINT_COLUMNS),
         ("probe", PROBE_TITLE, PROBE_COLUMNS),
         ("recall", RECALL_TITLE, RECALL_COLUMNS),
     )

@@ -136,6 +136,8 @@ class ConditionsConfig(TileOption, FrameCommandConfig):
     """Drawn frames of each condition."""
     real: Count = 48
     """Most real frames of each condition, in the order of the hash."""
+    states: NotNegative = 0
+    """Random feasible states of all codes, of the budget street, drawn on each frame."""
     full: Flag = False
     """Draw each weather with its own code at 1, and no other code, instead of its preset."""
     redraw: Flag = False
