@@ -247,7 +247,9 @@ CARD = """# The light of a closed sky, trained on generated streets
   each pixel's ray above the horizon. Three numbers a pixel: the logarithms of the ratios of red, green and blue
   under clouds to those in the photograph, within {bound} of 0. A guided filter moves their steps to the
   photograph's edges.
-- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Training starts from the
+- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project.
+  SHA-256: `{digest}`
+  Training starts from the
   segmenter's weights; nothing else is pretrained.
 - Data: {frames:,} streets of the project's own generator, version {version}, each under the sun and under a closed
   sky. No photographs. Other colours, other skies, shade of objects out of view; other exposure and contrast, blur,
@@ -310,6 +312,7 @@ def main() -> None:
         focal=unet.INPUT_FOCAL_PX,
         bound=CLOSED_SKY_LOG,
         file=arguments.out.name,
+        digest=files.sha256_digest(arguments.out),
         frames=settings.frames,
         version=GENERATOR_VERSION,
         clouded=CLOUDED_SHARE,

@@ -39,7 +39,7 @@ WEATHER_CODES = tuple(code.name.lower() for code in Weather)
 FOLIAGE_CODES = ("hue", "lightness", "density")
 SUN_CODES = ("azimuth", "elevation", "strength")
 WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
-    "fog": {"fog": 0.6, "overcast": 0.4},
+    "fog": {"fog": 0.6, "overcast": 0.8},
     "rain": {"rain": 0.8, "overcast": 1.0},
     "sunset": {"time": 0.5},
     "overcast": {"overcast": 1.0},

@@ -201,7 +201,7 @@ DUSK_ENDS, DIMMING, DIMMING_ENDS = 3.5, 0.25, 2.0
 """
 DAMP = 0.9
 """Weight of the wet picture at rain 1."""
-DAMP_LIGHT, DAMP_COLOUR = 0.97, 0.9
+DAMP_LIGHT, DAMP_COLOUR = 0.92, 1.0
 """Remaining light and colour in it."""
 WET_ROAD = 0.60
 """Remaining light of a wet road's own colour."""
@@ -217,7 +217,7 @@ meets, relative to its slope.
 """
 RAIN_EXTINCTION_PER_M = 0.003
 """Haze of strong rain at rain code 1."""
-RAIN_AIR = 1.0
+RAIN_AIR = 1.25
 """Brightness of that haze, relative to the airlight."""
 STREAKS = 0.06
 """Opacity of the streaks of rain 1."""
@@ -248,7 +248,7 @@ HAZE_CAP_M = 300.0
 
 NIGHTFALL = 4.0
 """Rate at which the share of night grows with its code: light falls by about equal factors."""
-STREET_RGB, STREET_BASE = (0.34, 0.25, 0.16), 0.08
+STREET_RGB, STREET_BASE = (0.42, 0.31, 0.20), 0.06
 """Light of street lamps relative to daylight, after the camera's exposure, in the middle of their pools; its share
 between them.
 """
@@ -262,9 +262,9 @@ STREET_LAMP_M, STREET_ASIDE_M, STREET_EVERY_M, STREET_FAR_M = 8.0, 7.0, 36.0, 32
 """Height of street lamps; their distance from the camera's path, alternately left and right; distance along it on
 each side, and of the farthest.
 """
-STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 5.0
+STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 7.0
 """Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
-HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (14.0, 200.0, 6.0), (6.0, 14.0), (2.2, 5.5)
+HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (14.0, 200.0, 3.0), (5.5, 14.0), (2.2, 5.5)
 """Lamps at houses and crossings: first and last distance along the street and that between two; distance from the
 camera's path; height.
 """
@@ -272,11 +272,11 @@ HOUSE_LAMP_RGB = ((1.0, 0.80, 0.50), (1.0, 0.95, 0.85), (0.9, 0.97, 1.0), (0.15,
 """Their colours: lamps, windows, signs, traffic lights."""
 LAMP_SHOWS = 0.75
 """Depth, relative to a lamp's, up to which a surface hides it: depths of a street's sides are estimates."""
-GLOW_RGB = (0.0095, 0.0070, 0.0054)
+GLOW_RGB = (0.0080, 0.0070, 0.0064)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6
 """Share of the picture's height over which that glow falls by a factor e."""
-HEAD_RGB, HEAD_FAR_M = (0.75, 0.64, 0.50), 18.0
+HEAD_RGB, HEAD_FAR_M = (0.95, 0.82, 0.66), 20.0
 """Light of the own headlamps, relative to daylight, on what is near; distance at which it has fallen to half."""
 SUN_SOFTENED = 1.0
 """Compression of daylight before street lamps replace it: sunlit surfaces come closer to those in the shade."""
@@ -309,7 +309,7 @@ NIGHT_BEND = 0.02
 
 LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0, 1.2)
 """Rates at which fog, rain, time, overcast, night and snow make drivers switch on their lamps."""
-TAIL_LAMP_RGB, HEADLAMP_RGB = (3.2, 0.12, 0.08), (8.0, 7.2, 6.0)
+TAIL_LAMP_RGB, HEADLAMP_RGB = (4.5, 0.16, 0.10), (8.0, 7.2, 6.0)
 """Light of a lamp that faces the camera by night; white is 1."""
 TAIL_CORE = 0.12
 """Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
@@ -321,7 +321,7 @@ LAMP_BY_DAY, LAMP_EXPOSURE = 0.12, (0.25, 0.3, 1.2, 0.1, 4.0, 0.2)
 """The same by daylight, where the exposure is shorter; rates at which fog, rain, time, overcast, night and snow make it
 longer.
 """
-LAMP_RADIUS_M, LAMP_LEAST_PX = 0.08, 0.6
+LAMP_RADIUS_M, LAMP_LEAST_PX = 0.09, 0.7
 """Radius of a lamp, as the standard deviation of a Gaussian; least such width in the picture."""
 LAMP_FACES = (-0.05, 0.35)
 """Cosine of a lamp's axis to the direction to the camera from which it shows, and shows fully."""

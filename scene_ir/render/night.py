@@ -214,11 +214,11 @@ def _street_lamps(scene: SceneIR, depth_m: np.ndarray) -> np.ndarray:
         column, row = round(u / w), round(v / w)
         if not (0 <= column < width and 0 <= row < height) or depth_m[row, column] < model.LAMP_SHOWS * z:
             continue
-        size = model.STREET_LAMP_AT_10_M * high / model.STREET_LAMP_M
+        size = model.STREET_LAMP_AT_10_M * (high / model.STREET_LAMP_M) ** 0.5
         radius = max(size * 10 / z * height / 720, 0.35)
         xs, ys = np.arange(width) - u / w, np.arange(height) - v / w
         spot = np.exp(-0.5 * np.square(ys / radius))[:, None] * np.exp(-0.5 * np.square(xs / radius))
-        out += spot[..., None] * 1.5 * np.array(colour)
+        out += spot[..., None] * 2.5 * np.array(colour)
     return out
 
 
