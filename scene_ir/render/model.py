@@ -279,6 +279,8 @@ LIT_HEIGHT_M = (1.0, 1.5)
 """Height above the ground from which it may be one, and is: sunlit patches on the ground are none."""
 GLARE = ((0.005, 0.5), (0.018, 0.3), (0.07, 0.10))
 """Glare of lamps: standard deviations, in heights of the picture, and shares of their light."""
+LIT_MIRROR = 12.0
+"""Light of lamps that a wet road mirrors, relative to that of their images, which are clipped."""
 GLARE_FOG, GLARE_RAIN = 3.0, 1.5
 """Relative growth of glare at fog 1 and rain 1."""
 CORNER = 0.45
@@ -310,8 +312,10 @@ HEADLAMP_WIDE = 0.06
 """Share of a headlamp's light outside of its beam."""
 STREAK, STREAK_SHARE = (0.05, 0.0015), 0.02
 """Widths of the streak across a lamp, in heights of the picture, and its share of the light."""
-DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH = 0.006, 0.15, 0.45
-"""Share of a lamp's light that a dry and a wet road mirror; length of that image, in distances from the lamp."""
+DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH, MIRROR_WIDTH = 0.006, 0.5, 0.35, 1.8
+"""Brightness of a lamp's image in a dry road, and in a wet one of what it mirrors; length of that image, in distances
+from the lamp, and its width, in widths of the lamp.
+"""
 LAMP_SEARCH = 0.14
 """Reach of the search for the photograph's own lamp, in widths of the vehicle."""
 TAIL_LAMP_RED, HEADLAMP_WHITE = (0.12, 0.25), (0.70, 0.85)
