@@ -27,5 +27,6 @@ PLAIN = MIRROR
 
 # Maps of night: rise of a pixel's ray, metres of height per metre of depth; share of the headlamps' beam, with the
 # gain of signs; light of the street lamps relative to that in a pool, for sky its glow relative to the horizon's;
-# share of the pixel that shines; loss of light towards the corners; standard normal noise (3); glare (3), light.
-RISE, AIM, STREET, LIT, CORNER, NOISE, GLARE, NIGHT_MAPS = 0, 1, 2, 3, 4, 5, 8, 11
+# share of the pixel that shines; loss of light towards the corners; standard normal noise (3); glare (3), light; what a
+# wet road mirrors of lamps (3), light.
+RISE, AIM, STREET, LIT, CORNER, NOISE, GLARE, WET, NIGHT_MAPS = 0, 1, 2, 3, 4, 5, 8, 11, 14

@@ -20,6 +20,7 @@ from scene_ir.geometry import clamp_inclusive, height_above_ground
 from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
+from scene_ir.render.reflections import mirror_share
 from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab
 from scene_ir.types import DAYLIGHT_DIM, Environment, SceneIR, Weather
 
@@ -246,10 +247,8 @@ def _apply_daylight(
     image = _dampen(image, environment.sky.to(image), weather, air)
     mist = _weathered_air(air, weather)[:, None, None]
     if mirrored is not None:
-        # A wet road is darker, and mirrors what stands above it, the more the flatter it is seen (Schlick 1994).
-        camera_m = environment.ground[3].to(image)
-        cos = camera_m / (camera_m * camera_m + depth * depth).sqrt()
-        share = model.FILM * (model.WATER + (1.0 - model.WATER) * (1.0 - cos) ** 5)
+        # A wet road is darker, and mirrors what stands above it.
+        share = mirror_share(depth, environment.ground[3].to(image))
         mirror = _dampen(mirrored[:3], mirrored[3], weather, air)
         sheen = model.SHEEN_MIRROR * mirror + model.SHEEN_AIR * mist - model.WET_ROAD * image
         wet = rain * environment.road.to(image)

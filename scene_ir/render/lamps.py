@@ -18,6 +18,7 @@ from torch import Tensor
 from scene_ir import ffd
 from scene_ir.geometry import to_clip
 from scene_ir.render import model
+from scene_ir.render.reflections import mirror_share
 from scene_ir.render.surfaces import rotate_y
 from scene_ir.render.texture import smoothstep
 from scene_ir.types import Crop, Environment, Mesh, Objects, Part, SceneIR, Weather
@@ -210,11 +211,12 @@ def draw_lamps(
     overflow = model.TAIL_CORE * colours[:, :1] * (~front)[:, None]
     light = _splat(spots, colours, height, width)
     light = light + _splat(spots[:1], overflow.expand_as(colours), height, width)
-    wet = model.DRY_MIRROR + (model.WET_MIRROR - model.DRY_MIRROR) * weather[Weather.RAIN]
+    wet = model.WET_MIRROR * mirror_share(depth, environment.ground[3].to(depth))
+    wet = model.DRY_MIRROR + (wet - model.DRY_MIRROR) * weather[Weather.RAIN]
     drop = (mirror_xy[:, 1] - xy[:, 1]).clamp(min=1.0)
-    mirrored = [(mirror_xy, area / core.square(), 1.5 * core, model.MIRROR_LENGTH * drop + core)]
+    mirrored = [(mirror_xy, area / core.square(), model.MIRROR_WIDTH * core, model.MIRROR_LENGTH * drop + core)]
     road = environment.road.to(centre)
-    return light + wet * road * _splat(mirrored, colours, height, width)
+    return light + road * _splat(mirrored, wet[:, None] * colours, height, width)
 
 
 def _splat(spots: list[tuple[Tensor, Tensor, Tensor, Tensor]], colours: Tensor, height: int, width: int) -> Tensor:

@@ -215,9 +215,9 @@ MIRROR_ROWS, MIRROR_REACH, MIRROR_SLACK = 180, 0.05, 0.05
 """Rows of the mirrored picture; share of them over which the road smears it, twice; slack of the search for what a ray
 meets, relative to its slope.
 """
-RAIN_EXTINCTION_PER_M = 0.003
+RAIN_EXTINCTION_PER_M = 0.002
 """Haze of strong rain at rain code 1."""
-RAIN_AIR = 1.25
+RAIN_AIR = 1.15
 """Brightness of that haze, relative to the airlight."""
 STREAKS = 0.06
 """Opacity of the streaks of rain 1."""
@@ -272,13 +272,13 @@ HOUSE_LAMP_RGB = ((1.0, 0.80, 0.50), (1.0, 0.95, 0.85), (0.9, 0.97, 1.0), (0.15,
 """Their colours: lamps, windows, signs, traffic lights."""
 LAMP_SHOWS = 0.75
 """Depth, relative to a lamp's, up to which a surface hides it: depths of a street's sides are estimates."""
-GLOW_RGB = (0.0080, 0.0070, 0.0064)
+GLOW_RGB = (0.0064, 0.0060, 0.0058)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6
 """Share of the picture's height over which that glow falls by a factor e."""
 HEAD_RGB, HEAD_FAR_M = (0.95, 0.82, 0.66), 20.0
 """Light of the own headlamps, relative to daylight, on what is near; distance at which it has fallen to half."""
-SUN_SOFTENED = 1.0
+SUN_SOFTENED = 0.2
 """Compression of daylight before street lamps replace it: sunlit surfaces come closer to those in the shade."""
 RETRO_WHITE = 1.5
 """Growth of the headlamps' light on the brightest surfaces: road markings and number plates send light back."""
@@ -296,6 +296,8 @@ LIT_HEIGHT_M = (1.0, 1.5)
 """Height above the ground from which it may be one, and is: sunlit patches on the ground are none."""
 GLARE = ((0.005, 0.5), (0.018, 0.3), (0.07, 0.10))
 """Glare of lamps: standard deviations, in heights of the picture, and shares of their light."""
+LIT_MIRROR = 12.0
+"""Light of lamps that a wet road mirrors, relative to that of their images, which are clipped."""
 GLARE_FOG, GLARE_RAIN = 3.0, 1.5
 """Relative growth of glare at fog 1 and rain 1."""
 CORNER = 0.45
@@ -329,8 +331,10 @@ HEADLAMP_WIDE = 0.15
 """Share of a headlamp's light outside of its beam."""
 STREAK, STREAK_SHARE = (0.05, 0.0015), 0.02
 """Widths of the streak across a lamp, in heights of the picture, and its share of the light."""
-DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH = 0.006, 0.15, 0.45
-"""Share of a lamp's light that a dry and a wet road mirror; length of that image, in distances from the lamp."""
+DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH, MIRROR_WIDTH = 0.006, 0.5, 0.35, 1.8
+"""Brightness of a lamp's image in a dry road, and in a wet one of what it mirrors; length of that image, in distances
+from the lamp, and its width, in widths of the lamp.
+"""
 LAMP_SEARCH = 0.14
 """Reach of the search for the photograph's own lamp, in widths of the vehicle."""
 TAIL_LAMP_RED, HEADLAMP_WHITE = (0.12, 0.25), (0.70, 0.85)

@@ -21,7 +21,8 @@ from torch import Tensor
 from scene_ir.geometry import height_above_ground
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
-from scene_ir.render.channels import AIM, CORNER, GLARE, NIGHT_MAPS, NOISE, RISE, STREET
+from scene_ir.render.channels import AIM, CORNER, GLARE, NIGHT_MAPS, NOISE, RISE, STREET, WET
+from scene_ir.render.reflections import mirror_in_ground, mirror_share
 from scene_ir.types import Environment, SceneIR, Weather
 
 
@@ -30,9 +31,10 @@ class NightMaps:
     """What night needs to know of a scene's pixels."""
 
     maps: Tensor
-    """(11, H, W): rise of a pixel's ray, metres of height per metre of depth; share of the headlamps' beam, with the
+    """(14, H, W): rise of a pixel's ray, metres of height per metre of depth; share of the headlamps' beam, with the
     gain of signs; light of the street lamps relative to that in a pool, for sky its glow relative to the horizon's;
-    share of the pixel that shines; loss of light towards the corners; standard normal noise (3); glare (3), light."""
+    share of the pixel that shines; loss of light towards the corners; standard normal noise (3); glare (3), light;
+    what a wet road mirrors of lamps (3), light."""
     camera_m: float
     """Height of the camera above the ground."""
     by_day: float
@@ -79,9 +81,14 @@ def compute_night_maps(scene: SceneIR, background: Tensor) -> NightMaps:
     planes = [rise.numpy(), aim, np.where(sky > 0.5, glow, street), lit, 2 * model.CORNER * radius]
     fixed = torch.from_numpy(np.stack([*planes])).to(like)
     glare = glare + lamps + ((1 - sky) * missed * glow)[..., None] * np.array(model.GLOW_RGB)
-    glare = torch.from_numpy(np.ascontiguousarray(np.moveaxis(glare, 2, 0))).to(like)
+    glare, shining = (
+        torch.from_numpy(np.ascontiguousarray(np.moveaxis(light, 2, 0))).to(like)
+        for light in (glare, shining)
+    )
+    mirrored = mirror_in_ground(shining, 1.0 / scene.depth, scene.environment.road, rise, camera_m)
+    wet = model.LIT_MIRROR * mirror_share(scene.depth, camera_m).to(like) * mirrored
     return NightMaps(
-        torch.cat([fixed, _noise_field(height, width).to(like), glare]), camera_m, measure_daylight(scene)
+        torch.cat([fixed, _noise_field(height, width).to(like), glare, wet]), camera_m, measure_daylight(scene)
     )
 
 
@@ -105,7 +112,7 @@ def apply_night(
     Args:
         image: (3, H, W).
         inverse_depth: (H, W) 1/m, 0 in the sky.
-        environment: Weather code and map of the sky.
+        environment: Weather code, maps of sky and road.
         lit: (H, W) in [0, 1], share of each pixel that shines: the map, where nothing hides it.
         lamps: (3, H, W), light of the vehicles' lamps.
         night: Maps of the scene.
@@ -115,6 +122,7 @@ def apply_night(
     share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) * (night.by_day / math.expm1(-model.NIGHTFALL))
     growth = 1.0 + model.GLARE_FOG * code[Weather.FOG] + model.GLARE_RAIN * code[Weather.RAIN]
     sky, maps = environment.sky.to(image), night.maps.to(image)
+    lamps = lamps + (share * code[Weather.RAIN]) * environment.road.to(image) * maps[WET:NIGHT_MAPS]
     if backend == "warp":
         from scene_ir.render.kernels import night as kernels
 
@@ -131,11 +139,7 @@ def apply_night(
     day = image.square()
     surface = day / (1.0 + model.SUN_SOFTENED * day)
     headlit = head * colours[1] * (day + model.RETRO_WHITE * day.pow(3))
-    light = (
-        (surface * shone + headlit) * (1.0 - sky)
-        + sky * maps[STREET] * colours[3]
-        + growth * maps[GLARE:NIGHT_MAPS]
-    )
+    light = (surface * shone + headlit) * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:WET]
     bend = model.NIGHT_BEND**2
     dark = image + (torch.sqrt(day + share * (light - day) + lamps + bend) - torch.sqrt(day + bend))
     seen = dark * (1.0 - share * maps[CORNER])

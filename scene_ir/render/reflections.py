@@ -43,6 +43,12 @@ def mirror_in_ground(
     return interpolate(mirrored[None], scale_factor=step, mode="bilinear")[0, :, :height, :width]
 
 
+def mirror_share(depth: Tensor, camera_m: Tensor | float) -> Tensor:
+    """Share of light that a wet road mirrors at a depth (...) m: the more, the flatter it is seen (Schlick 1994)."""
+    cos = camera_m / (camera_m * camera_m + depth * depth).sqrt()
+    return model.FILM * (model.WATER + (1.0 - model.WATER) * (1.0 - cos) ** 5)
+
+
 def _first_above(values: Tensor, limits: Tensor) -> Tensor:
     """Row (H, W) of the first value above each place in its column that reaches the place's limit; 0 where none does.
 

@@ -331,7 +331,7 @@ BAD = [
     ("dtype", edit("ignore", value={"dtype": "object", "values": []}), r"ignore: dtype: expected one of"),
     ("others", edit("others", "kind", value=[1]), r"others: kind\[0\]: expected text, found int"),
     ("others-rows", edit("others", "kind", value=[]), r"others: boxes_xyxy: expected shape \(0, 4\), found"),
-    ("weather", edit("environment", "weather", value=[0] * 3), r"environment: weather: expected shape \(5,\)"),
+    ("weather", edit("environment", "weather", value=[0] * 3), r"environment: weather: expected shape \(6,\)"),
     ("sources", edit("sources", 1), r"objects\.source: expected 2 entries or none, found 1"),
     ("source", edit("sources", 0, "ffd"), r"sources\[0\]: ffd: expected a value"),
     (

@@ -174,7 +174,7 @@ def _night_adjoint_kernel(
 
 class _Night(torch.autograd.Function):
     """Night over image (3, H, W) at inverse depth (H, W); sky, lit (H, W); lamps (3, H, W); settings (2,); maps
-    (11, H, W).
+    (14, H, W).
     """
 
     @staticmethod
@@ -233,7 +233,7 @@ def apply_night(
     Args:
         image, inverse, sky, lit, lamps: As there.
         settings: (2,), share of night and growth of glare.
-        maps: (11, H, W).
+        maps: (14, H, W).
         camera_m: Height of the camera, m.
     """
     return _Night.apply(image, inverse, sky, lit, lamps, settings, maps, camera_m)

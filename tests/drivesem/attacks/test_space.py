@@ -55,14 +55,14 @@ def test_unknown_combo_and_budget():
 
 def test_cardinality_bounds_and_steps(street):
     space = ParameterSpace(street(), ALL, WIDE)
-    assert space.dim == 4 * 5 + 5 + 3 + 4 * 2 + 4 * 1 + 4 * 96 + 4 * 1 + 3 + 4 * 1
+    assert space.dim == 4 * 5 + 6 + 3 + 4 * 2 + 4 * 1 + 4 * 96 + 4 * 1 + 3 + 4 * 1
     for tensor in (space.theta0, space.lower, space.upper, space.step):
         assert tuple(tensor.shape) == (space.dim,)
     assert bool((space.lower <= 0).all())
     assert bool((space.upper >= 0).all())
     weather = space.blocks.get(Parameter.WEATHER)
-    assert space.lower[weather].tolist() == [0.0] * 5
-    assert space.upper[weather].tolist() == [1.0] * 5
+    assert space.lower[weather].tolist() == [0.0] * 6
+    assert space.upper[weather].tolist() == [1.0] * 6
     steps = {p.value: float(space.step[space.blocks.get(p)][0]) for p in ALL}
     assert steps == pytest.approx(
         {"color": 0.05, "weather": 0.25, "foliage": 0.1, "translate": 0.01, "rotate": 0.01, "mesh": 0.025}
@@ -223,7 +223,7 @@ def test_apply_has_the_gradient_of_its_differences(street):
     scene = street(positions_xz=((0.0, 12.0),), dtype=torch.float64, tilt=0.03)
     space = ParameterSpace(scene, ALL, WIDE)
     generator = torch.Generator().manual_seed(5)
-    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 3, 5, 5, 3, 3, 1)]
+    weights = [torch.randn(n, generator=generator, dtype=torch.float64) for n in (3, 1, 192, 3, 5, 6, 3, 3, 1)]
 
     def functional(theta):
         s = space.apply(scene, theta)

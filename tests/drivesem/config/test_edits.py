@@ -264,7 +264,7 @@ def test_all_and_one_add_up_and_codes_end_at_their_bounds(street: Street) -> Non
     turned = torch.rad2deg(after.objects.yaw - scene.objects.yaw)
     torch.testing.assert_close(turned, torch.tensor([1.0, 1.0, 3.0, 1.0]), atol=1e-4, rtol=0)
     foggy = apply_changes(apply_changes(scene, edit_of("weather.fog=0.8")), edit_of("weather.fog=0.8"))
-    assert foggy.environment.weather.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
+    assert foggy.environment.weather.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_no_change_keeps_every_bit(street: Street) -> None:
@@ -272,7 +272,7 @@ def test_no_change_keeps_every_bit(street: Street) -> None:
     after = apply_changes(scene, edit_of("objects[all].rotate=0deg"))
     assert torch.equal(after.objects.translation, scene.objects.translation)
     assert torch.equal(after.objects.yaw, scene.objects.yaw)
-    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0, 0))).environment.weather[0] == 1
+    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0, 0, 0))).environment.weather[0] == 1
 
 
 def test_removal_names_rows(street: Street) -> None:

@@ -30,7 +30,7 @@ def _inputs(height: int, width: int) -> tuple[list[Tensor], night.NightMaps]:
         return torch.rand(*shape, generator=generator).double()
 
     planes = [(noise(1, height, width) - 0.6) * 0.3, *(noise(1, height, width) for _ in range(4))]
-    maps = torch.cat([*planes, 4 * noise(3, height, width) - 2, 0.1 * noise(3, height, width)])
+    maps = torch.cat([*planes, 4 * noise(3, height, width) - 2, 0.1 * noise(6, height, width)])
     inverse = (noise(height, width) * 0.4 - 0.05).clamp(min=0.0)
     image = noise(3, height, width) * 1.1 - 0.05
     inputs = [image, inverse, noise(height, width), noise(height, width), 0.2 * noise(3, height, width)]
@@ -41,7 +41,7 @@ def _apply(inputs: list[Tensor], code: Tensor, maps: night.NightMaps, backend: s
     image, inverse, sky, lit, lamps = inputs
     blank = torch.zeros_like(sky)
     none = code.new_zeros(3)
-    environment = Environment(code, none, none, code.new_zeros(4), sky, blank, blank)
+    environment = Environment(code, none, none, code.new_zeros(4), sky, blank, 1.0 - sky)
     return night.apply_night(image, inverse, environment, lit, lamps, maps, backend)  # type: ignore[arg-type]
 
 
