@@ -45,7 +45,7 @@ WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
     "overcast": {"overcast": 1.0},
     "twilight": {"time": 1.0},
     "night": {"night": 1.0, "overcast": 0.3},
-    "snow": {"snow": 0.8},
+    "snow": {"snow": 0.6},
 }
 """Weather codes by name; all others are 0."""
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "lamps", "remove")

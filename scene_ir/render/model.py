@@ -221,7 +221,7 @@ RAIN_AIR = 1.15
 """Brightness of that haze, relative to the airlight."""
 STREAKS = 0.06
 """Opacity of the streaks of rain 1."""
-SNOW_FOG, SNOW_COVER = 0.25, 1.0
+SNOW_FOG, SNOW_COVER = 0.08, 0.9
 """Haze and clouds of snow 1, as codes of fog and overcast."""
 SLUSH, SLUSH_LIGHT = 0.18, 0.80
 """How far the road of snow 1 turns towards a brightness."""
@@ -264,7 +264,7 @@ each side, and of the farthest.
 """
 STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 7.0
 """Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
-HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (14.0, 200.0, 3.0), (5.5, 14.0), (2.2, 5.5)
+HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (24.0, 210.0, 3.0), (5.5, 14.0), (2.2, 5.5)
 """Lamps at houses and crossings: first and last distance along the street and that between two; distance from the
 camera's path; height.
 """
@@ -272,7 +272,7 @@ HOUSE_LAMP_RGB = ((1.0, 0.80, 0.50), (1.0, 0.95, 0.85), (0.9, 0.97, 1.0), (0.15,
 """Their colours: lamps, windows, signs, traffic lights."""
 LAMP_SHOWS = 0.75
 """Depth, relative to a lamp's, up to which a surface hides it: depths of a street's sides are estimates."""
-GLOW_RGB = (0.0064, 0.0060, 0.0058)
+GLOW_RGB = (0.0060, 0.0059, 0.0060)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6
 """Share of the picture's height over which that glow falls by a factor e."""
