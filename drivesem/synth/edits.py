@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from drivesem.config.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
-from drivesem.synth.frames import Plan
+from drivesem.synth.frames import Plan, stream
 from drivesem.synth.lamps import darken, lamps_on, open_lens
 from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
@@ -34,12 +34,14 @@ from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, S
 from scene_ir.render.texture import apply_texture_code
 from scene_ir.types import Weather
 
-__all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]
+__all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "draw_night", "read_edits"]
 
 _GAMMA = 2.2
 """Display values to linear light."""
-_DRAWN = (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST, Weather.NIGHT)
+DRAWN_WEATHER = (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST, Weather.NIGHT)
 """Codes of weather that the generator draws."""
+_WET_NIGHTS, _BRAKING, _UNLIT = 0.3, 0.25, 0.03
+"""Shares of nights in rain, and of drivers who brake or have no lamps on."""
 
 
 def apply_edits(plan: Plan, edits: Edits, frame: int) -> Plan:
@@ -49,6 +51,26 @@ def apply_edits(plan: Plan, edits: Edits, frame: int) -> Plan:
         if key in edits:
             plan = apply_edit(plan, edits[key], f"frame {key}")
     return plan
+
+
+def draw_night(plan: Plan, share: float) -> Plan:
+    """The plan, by night in a share of streets: under other clouds, some in rain; of drivers who stand or drive, some
+    brake and a few have forgotten their lamps.
+    """
+    seed, street, attempt = plan.origin
+    rng = stream(seed, street, plan.split, 16 * attempt + 7)
+    if rng.random() >= share:
+        return plan
+    rain = float(rng.uniform(0.3, 1.0)) if rng.random() < _WET_NIGHTS else 0.0
+    weather = [0.0] * len(Weather)
+    weather[Weather.NIGHT], weather[Weather.RAIN] = float(rng.uniform(0.75, 1.0)), rain
+    weather[Weather.OVERCAST] = float(rng.uniform(0.5, 1.0)) if rain else float(rng.uniform(0.0, 1.0))
+    lamps: dict[int | str, ObjectEdit] = {}
+    for actor in plan.actors:
+        chance, amount = float(rng.random()), float(rng.uniform(0.3, 1.0))
+        if not actor.parked and chance < _BRAKING + _UNLIT:
+            lamps[actor.track] = ObjectEdit(lamps=amount if chance < _BRAKING else -1.0)
+    return apply_edit(plan, FrameEdit(objects=lamps, weather=tuple(weather)))
 
 
 def apply_edit(plan: Plan, edit: FrameEdit, where: str = "edit") -> Plan:
@@ -131,7 +153,7 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
     if not any(code):
         return light
     for weather in Weather:
-        if code[weather] and weather not in _DRAWN:
+        if code[weather] and weather not in DRAWN_WEATHER:
             name = f"weather.{weather.name.lower()}"
             raise RangeError(name, "0, since generated streets are drawn without it", code[weather])
     fog, rain, time, overcast = (code[w] for w in (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST))

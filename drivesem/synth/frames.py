@@ -506,6 +506,7 @@ def render_frame(
             "weather": setting.light.weather,
             "variation": plan.variation,
             "time_s": round(plan.time_s, 6),
+            **({"night": round(setting.light.night, 6)} if setting.light.night else {}),
             "vehicles": sorted(vehicles),
             **surround.used,
         },

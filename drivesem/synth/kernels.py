@@ -31,7 +31,17 @@ from drivesem.synth.light import (
     ground_light,
 )
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
-from drivesem.synth.view import BYTE_SUM_SCALE, LAMP_NUMBERS, SIZE, NoiseSet, Setting, Shadow, Sight, SunMaps, fine_matrix
+from drivesem.synth.view import (
+    BYTE_SUM_SCALE,
+    LAMP_NUMBERS,
+    SIZE,
+    NoiseSet,
+    Setting,
+    Shadow,
+    Sight,
+    SunMaps,
+    fine_matrix,
+)
 from scene_ir.raster.launch import launch, split_range, start_warp, threads
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, log_
 from scene_ir.raster.verbs import NEAR_M
@@ -463,9 +473,7 @@ def lamp_light(s: Spot, air: Air, i: int):
 @wp.func
 def towards_lamp(s: Spot, air: Air, i: int):
     at = i * LAMP
-    return wp.normalize(
-        wp.vec3f(load(air.lamps, at), load(air.lamps, at + 1), load(air.lamps, at + 2)) - s.point
-    )
+    return wp.normalize(wp.vec3f(load(air.lamps, at), load(air.lamps, at + 1), load(air.lamps, at + 2)) - s.point)
 
 
 @wp.func

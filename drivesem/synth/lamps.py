@@ -57,7 +57,7 @@ _SWITCHED_ON = np.array([1.4, 1.1, 1.5, 0.25, 3.0])
 _ZENITH, _HORIZON = np.array([0.0007, 0.0007, 0.0009]), np.array([0.0040, 0.0033, 0.0028])
 """The sky over a town."""
 _AMBIENT = np.array([0.0080, 0.0068, 0.0056])
-_AIRGLOW = 7.0
+_AIRGLOW = 12.0
 """Growth of the horizon's light in fog, which the town lights."""
 _VIGNETTE, _NOISE, _BLUR_PX = 0.22, 1.5, 0.15
 """What the lens, wide open, and the sensor add by night: loss in the corners, factor of noise, blur."""
@@ -151,14 +151,19 @@ def own_lamps(view: View, light: Light, states: LampStates) -> np.ndarray:
     return _table(
         [
             _row(
-                view.to_camera(low + side * right) - view.centre, view.rotation @ ahead, _HEAD_LIGHTS[0] * level, BEAM
+                view.to_camera(low + side * right) - view.centre,
+                view.rotation @ ahead,
+                _HEAD_LIGHTS[0] * level,
+                BEAM,
             )
             for side in (-0.62, 0.62)
         ]
     )
 
 
-def vehicle_lamps(actor: Actor, soup: Soup, axis: np.ndarray, up: np.ndarray, states: LampStates) -> tuple[Soup, np.ndarray]:
+def vehicle_lamps(
+    actor: Actor, soup: Soup, axis: np.ndarray, up: np.ndarray, states: LampStates
+) -> tuple[Soup, np.ndarray]:
     """A vehicle with its lamps as they are on, and their rows (k, 11).
 
     Args:

@@ -129,7 +129,9 @@ def with_glare(image: np.ndarray, shining: np.ndarray, setting: Setting) -> np.n
     air = 1 + light.haze_per_m * _GLARE_M
     glare = np.zeros_like(image)
     for i, (across, down, share) in enumerate(_GLARE):
-        glare += cv2.GaussianBlur(shining, (0, 0), across * height, sigmaY=down * height) * (share * (air if i else 1))
+        glare += cv2.GaussianBlur(shining, (0, 0), across * height, sigmaY=down * height) * (
+            share * (air if i else 1)
+        )
     plain = replace(setting.response, exposure=1.0, white_balance=np.ones(1))
     linear = np.minimum(image, _WHITE) ** np.float32(2.2 / plain.contrast)
     fourth = np.square(np.square(linear))
@@ -181,7 +183,7 @@ _GLARE = ((0.004, 0.004, 0.10), (0.014, 0.014, 0.05), (0.07, 0.07, 0.03), (0.06,
 """Glare of lens and windscreen: standard deviations across and down, in heights of the picture, and shares; the last
 is the streak of wipers.
 """
-_GLARE_M = 60.0
+_GLARE_M = 150.0
 """Haze of one over this length doubles the glare, except for the narrowest."""
 _WHITE = np.float32(0.998)
 """Display value from which a pixel counts as just white, where glare is added."""

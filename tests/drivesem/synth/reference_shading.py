@@ -245,7 +245,9 @@ def _polish(
     gloss: tuple[float, float, float],
     lamps: np.ndarray,
 ) -> np.ndarray:
-    """Radiance mirrored by a smooth coat, and of what shines: gloss is (reflectance at right angles, weight, sharpness of the sun)."""
+    """Radiance mirrored by a smooth coat, and of what shines: gloss is (reflectance at right angles, weight,
+    sharpness of the sun).
+    """
     view = unit(s.point)
     cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
     mirror = (view + 2 * cosine[:, None] * s.normal).astype(_F)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from drivesem.synth.edits import ALL, FrameEdit, ObjectEdit, apply_edit, apply_edits, read_edits
-from drivesem.synth.frames import SynthSettings, plan_frame, render_frame
+from drivesem.synth import edits
+from drivesem.synth.edits import ALL, FrameEdit, ObjectEdit, apply_edit, apply_edits, draw_night, read_edits
+from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, plan_frame, render_frame
+from drivesem.synth.lamps import beam_share
 from drivesem.synth.layout import LayoutSettings, clearance, footprint
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
+from scene_ir.meshes.templates import template
 from scene_ir.render.environment import apply_weather, sky_colour
+from scene_ir.render.lamps import find_lamp_places
+from scene_ir.types import Weather
 
 SETTINGS = SynthSettings(LayoutSettings(people=False, vehicles=(6, 8)), sunny=True)
 
@@ -151,6 +157,124 @@ def test_sunset_and_twilight_are_the_compositors(plan, time):
     composed = apply_weather(picture, inverse, environment, sky_colour(picture, environment.sky.double()))
     expected = drawn.image.reshape(-1, 3).mean(axis=0) / 255
     assert composed.flatten(1).mean(dim=1).numpy() == pytest.approx(expected, rel=0.2)
+
+
+def weather(**codes: float) -> tuple[float, ...]:
+    return tuple(codes.get(code.name.lower(), 0.0) for code in Weather)
+
+
+def render_edit(plan: Plan, **edit: Any) -> SynthFrame:
+    frame = render_frame(apply_edit(plan, FrameEdit(**edit)))
+    assert frame is not None
+    return frame
+
+
+NIGHT = weather(night=1.0)
+
+
+def test_night_leaves_the_labels_and_gives_the_same_bytes_again(plan):
+    day, night, again = render_edit(plan), *(render_edit(plan, weather=NIGHT) for _ in range(2))
+    assert torch.equal(day.labels.boxes_xyxy, night.labels.boxes_xyxy)
+    assert np.array_equal(day.depth_m, night.depth_m)
+    assert np.array_equal(day.instance, night.instance)
+    assert np.array_equal(day.semantic, night.semantic)
+    assert night.image.tobytes() == again.image.tobytes()
+
+
+def test_daylight_falls_with_the_code_of_night(plan):
+    frames = [render_edit(plan, weather=weather(night=code)) for code in (0.0, 0.01, 0.25, 0.5, 0.75, 1.0)]
+    sky = frames[0].environment.sky.numpy() > 0.9
+    levels = [float(frame.image[sky].mean()) for frame in frames]
+    assert levels == sorted(levels, reverse=True)
+    assert levels[0] - levels[1] < 4
+    assert frames[-1].image.mean() < 0.5 * frames[0].image.mean()
+
+
+def test_lamps_by_day_change_nothing_unless_they_brake(plan):
+    day, off, brake = (render_edit(plan, objects={ALL: ObjectEdit(lamps=code)}) for code in (0.0, -1.0, 1.0))
+    assert day.image.tobytes() == off.image.tobytes()
+    redder = brake.image[..., 0].astype(int) - day.image[..., 0]
+    assert redder.max() > 40
+    assert (redder[day.instance == 0] > 40).mean() < 1e-3
+
+
+@pytest.mark.parametrize(("code", "least"), [(0.0, 0.5), (1.0, 0.8)])
+def test_lamps_shine_where_the_vehicles_have_them(code, least):
+    """Lamps of driving cars are brighter than the same cars without, at the places of the template's lamps."""
+    plan = plan_frame(9, 5, settings=SETTINGS)
+    plan = replace(plan, actors=tuple(replace(actor, parked=False) for actor in plan.actors))
+    lit, off = (
+        render_edit(plan, weather=NIGHT, objects={ALL: ObjectEdit(lamps=c)}).image.astype(int)
+        for c in (code, -1.0)
+    )
+    truths = render_edit(plan).truths
+    shining, count = 0, 0
+    for truth in truths:
+        if truth.visible < 0.9 or truth.box_xyxy[3] - truth.box_xyxy[1] < 40 or truth.actor.label != "Car":
+            continue
+        places = find_lamp_places(template(truth.actor.kind, truth.actor.variant)).numpy() * truth.actor.size_lhw
+        cos, sin = math.cos(truth.yaw), math.sin(truth.yaw)
+        turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+        points = places @ turn.T + truth.translation
+        axes = np.array([turn[:, 0] * sign for sign in (1, 1, -1, -1)])
+        facing = -(points * axes).sum(axis=1) / np.linalg.norm(points, axis=1)
+        seen = (
+            np.concatenate([points, np.ones((4, 1))], axis=1) @ plan.setting.view.camera.matrix.double().numpy().T
+        )
+        for x, y in np.rint(seen[facing > 0.5, :2] / seen[facing > 0.5, 2:]).astype(int):
+            if 3 <= y < lit.shape[0] - 3 and 3 <= x < lit.shape[1] - 3:
+                count += 1
+                shining += (lit - off)[y - 2 : y + 3, x - 2 : x + 3].max() > 60
+    assert count >= 4
+    assert shining >= least * count
+
+
+def test_a_parked_car_is_dark_by_night(plan):
+    parked = replace(plan, actors=tuple(replace(a, parked=True) for a in plan.actors))
+    auto, off = (
+        render_edit(parked, weather=NIGHT, objects={ALL: ObjectEdit(lamps=code)}).image for code in (0.0, -1.0)
+    )
+    assert auto.tobytes() == off.tobytes()
+
+
+def test_headlamps_light_what_is_near_and_below_their_cut_off():
+    axis, up = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
+    degrees = np.deg2rad([-6.0, -2.0, 2.0, 10.0])
+    rise = beam_share(np.stack([0 * degrees, -np.sin(degrees), np.cos(degrees)], axis=1), axis, up)
+    assert rise[1] > rise[0] > 10 * rise[2]
+    assert rise[2] == pytest.approx(rise[3], rel=0.05)
+    turn = np.deg2rad([0.0, 15.0, 40.0, 89.0, 120.0])
+    down = np.sin(0.04)
+    aside = beam_share(np.stack([np.sin(turn), np.full(5, down), np.cos(turn)], axis=1), axis, up)
+    assert (np.diff(aside[:4]) < 0).all()
+    assert aside[4] == 0
+
+
+def test_a_wet_road_mirrors_tail_lamps_below_them(plan):
+    wet, dry = weather(night=1.0, rain=1.0), NIGHT
+    red = {}
+    for name, codes in (("wet", wet), ("dry", dry)):
+        on, off = (render_edit(plan, weather=codes, objects={ALL: ObjectEdit(lamps=c)}) for c in (1.0, -1.0))
+        change = on.image.astype(int) - off.image
+        road = on.environment.road.numpy() > 0.9
+        red[name] = np.where(road & (on.instance == 0), change[..., 0] - change[..., 1], 0)
+    assert np.quantile(red["wet"], 0.995) > 1.5 * max(np.quantile(red["dry"], 0.995), 4)
+
+
+def test_weather_that_the_generator_does_not_draw_is_one_line(plan, monkeypatch):
+    monkeypatch.setattr(edits, "DRAWN_WEATHER", (Weather.FOG,))
+    with pytest.raises(RangeError, match=r"weather.night: expected 0, since generated streets .* found 1.0"):
+        apply_edit(plan, FrameEdit(weather=NIGHT))
+
+
+def test_nights_are_drawn_for_a_share_of_streets():
+    plans = [draw_night(plan_frame(3, i, settings=SETTINGS), 0.5) for i in range(40)]
+    nights = [plan for plan in plans if plan.setting.light.night > 0]
+    assert 10 < len(nights) < 30
+    assert 0 < sum(plan.setting.light.wet > 0 for plan in nights) < len(nights)
+    assert {a.lamps < 0 for plan in nights for a in plan.actors} == {True, False}
+    plain = plan_frame(3, 0, settings=SETTINGS)
+    assert draw_night(plain, 0.0) is plain
 
 
 def test_bare_trees_have_fewer_leaves_and_dense_ones_no_fewer(plan):

@@ -138,7 +138,9 @@ NIGHT = {
 def some_lamps(view: View) -> np.ndarray:
     """A street lamp, headlamps from behind the camera and towards it, a tail lamp of actor 1."""
     ahead = view.rotation @ np.array([np.sin(view.heading), 0.0, np.cos(view.heading)])
-    places = view.to_camera(np.array([[2, -7, 14], [0.6, -0.7, 1], [-3, -0.7, 40], [-2, -0.8, 8]], float)) - view.centre
+    places = (
+        view.to_camera(np.array([[2, -7, 14], [0.6, -0.7, 1], [-3, -0.7, 40], [-2, -0.8, 8]], float)) - view.centre
+    )
     axes = np.stack([-view.up, ahead, -ahead, -ahead])
     colours = np.array([[26, 18, 10], [120, 100, 80], [90, 95, 100], [2, 0.1, 0.05]])
     kinds = np.array([[lamps.STREET, 0], [lamps.BEAM, 0], [lamps.BEAM, 0], [lamps.TAIL, 1]])
