@@ -25,7 +25,8 @@ _ROAD_ALBEDO, _DAYLIGHT = 0.11, (0.5, 4.0)
 _SPACING_M, _POSTS, _ASIDE_M, _POST_M = 28.0, 12, 6.5, 8.5
 """Distance along the road between street lamps, alternately left and right; their number, distance from the camera's
 path, and height."""
-_STREET, _STREET_CD = np.array([1.0, 0.74, 0.45], np.float32), 44.0
+_STREET, _STREET_CD, _POST_LAMP_M = np.array([1.0, 0.74, 0.45], np.float32), 32.0, 0.16
+"""Colour of a street lamp, its intensity below, and its width."""
 _OWN, _OWN_CD, _OWN_PLACE_M = np.array([1.0, 0.88, 0.68], np.float32), 260.0, (0.6, 0.7, 1.2)
 """Own headlamps: colour, intensity, place to either side, above the ground, ahead."""
 _BEAM_RAD, _CUT, _CUT_WIDTH, _DROP, _STRAY = 0.30, 0.012, 0.006, 0.12, 0.014
@@ -42,8 +43,8 @@ _LAMPS_LIT = np.array([1.5, 1.2, 1.5, 0.3, 3.0], np.float32)
 """How much fog, rain, time, overcast and night make drivers switch on their lamps."""
 _TAIL, _HEAD = np.array([2.0, 0.1, 0.05], np.float32), np.array([6.0, 5.5, 4.5], np.float32)
 """Light of a vehicle's lamps by night; white is 1."""
-_LAMP_M, _LAMP_BY_DAY, _BRAKING = 0.09, 0.15, 2.5
-"""Radius of a lamp; its light by day, relative to that by night; light of a brake lamp, relative to a tail lamp's."""
+_LAMP_M, _LAMP_BY_DAY, _BRAKING = 0.06, 0.15, 2.5
+"""Width of a lamp; its light by day, relative to that by night; light of a brake lamp, relative to a tail lamp's."""
 _FOG_PER_M, _RAIN_PER_M = 0.03, 0.006
 _WINDOW = 0.93
 """Display value from which a small area above the ground counts as a lamp or a lit window."""
@@ -135,7 +136,7 @@ def _light_by_night(
     level = float(np.median(light[road > 0.5])) if (road > 0.5).sum() > 500 else 0.2
     albedo = np.clip(light / np.clip(level / _ROAD_ALBEDO, *_DAYLIGHT), 0, 0.9)
 
-    def lit_by(place: Array, intensity: NDArray[np.floating] | float, away: Array, square: Array) -> Array:
+    def lit_by(intensity: Array, away: Array, square: Array) -> Array:
         slope = np.where(flat, np.clip(-(away @ up), 0, 1), _MATT)
         back = np.where(flat, 1 - _BACKWARD + _BACKWARD / np.maximum(slope + seen, 1e-2), 1)
         return intensity * slope * back / (square + 0.1)
@@ -154,8 +155,9 @@ def _light_by_night(
         # the ground below it, then up
         place = place + (_POST_M - float(place @ up) - above_m) * up
         away, square = from_lamp(place)
-        street += lit_by(place, _STREET_CD, away, square)
-        _draw_disc(shining, place, 0.22, camera, 12 * _STREET, (owner == 0) & (depth_m > place[2]))
+        # none of its light goes up
+        street += lit_by(_STREET_CD * np.clip(-3 * (away @ up), 0, 1), away, square)
+        _draw_spot(shining, place, _POST_LAMP_M, camera, 12 * _STREET, (owner == 0) & (depth_m > place[2]))
     head = np.zeros_like(depth_m)
     for side in (-_OWN_PLACE_M[0], _OWN_PLACE_M[0]):
         place = foot + _OWN_PLACE_M[1] * up + np.array([side, 0, _OWN_PLACE_M[2]], np.float32)
@@ -163,7 +165,7 @@ def _light_by_night(
         rise, aside = away @ up, np.arctan2(away[..., 0], np.maximum(away[..., 2], 1e-3))
         below = 1 / (1 + np.exp(np.clip((rise + _CUT) / _CUT_WIDTH, -30, 30)))
         beam = below * np.exp(-np.square(aside / _BEAM_RAD) - np.maximum(-rise - 0.03, 0) / _DROP) + _STRAY
-        head += lit_by(place, _OWN_CD * beam, away, square)
+        head += lit_by(_OWN_CD * beam, away, square)
     leaves = np.maximum(to_numpy(environment.foliage_map), to_numpy(environment.sky))
     signs = _find_signs(light, leaves) * (owner == 0)
     incoming = _TOWN + street[..., None] * _STREET + (head * (1 + _SIGN_GAIN * signs))[..., None] * _OWN
@@ -184,10 +186,13 @@ def _find_signs(light: Array, leaves: Array) -> Array:
 
 def _find_windows(light: Array, leaves: Array) -> Array:
     """Where (H, W) the photograph has small bright areas away from the sky: lamps and windows."""
+    size = max(light.shape[0] // 24, 3)
     bright = (light.min(axis=2) ** (1 / GAMMA) > _WINDOW).astype(np.uint8)
-    large = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((max(light.shape[0] // 24, 3),) * 2, np.uint8))
-    open_sky = cv2.dilate((leaves > 0.2).astype(np.uint8), np.ones((light.shape[0] // 12,) * 2, np.uint8))
-    return ((bright > 0) & (large == 0) & (open_sky == 0)).astype(np.float32)
+    # edges and wires are thin
+    solid = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    large = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) | (leaves > 0.2)
+    near = cv2.dilate(large, np.ones((2 * size + 1,) * 2, np.uint8))
+    return solid * (1.0 - near).astype(np.float32)
 
 
 def _stands_in_traffic(pose: VehiclePose, environment: Environment, camera: PictureCamera) -> float:
@@ -217,7 +222,7 @@ def _draw_lamps(
     extinction: float,
     levels: Array,
 ) -> None:
-    """Add the light of a vehicle's visible lamps, discs at usual places of its box, and their images on a wet road.
+    """Add the light of a vehicle's visible lamps, at usual places of its box, and their images on a wet road.
 
     Args:
         lamps: (H, W, 3) light, changed in place.
@@ -240,20 +245,22 @@ def _draw_lamps(
             continue
         colour = levels[0] * _HEAD * facing**4 if along > 0 else levels[1] * _TAIL * min(2 * facing, 1)
         colour = colour * np.exp(-extinction * place[2])
-        _draw_disc(lamps, place, _LAMP_M, camera, colour, seen)
+        _draw_spot(lamps, place, _LAMP_M, camera, colour, seen)
         below = place - 2 * float(place @ ground[:3] + ground[3] - camera.shift_m @ ground[:3]) * ground[:3]
         _draw_streak(mirrored, place, below.astype(np.float32), camera, colour)
 
 
-def _draw_disc(
+def _draw_spot(
     light: Array, place: Array, radius_m: float, camera: PictureCamera, colour: Array, where: NDArray[np.bool_]
 ) -> None:
-    """Add a disc's light to (H, W, 3), where it may be seen."""
-    x, y = (round(float(v)) for v in camera.project(place.astype(np.float32)))
-    disc = np.zeros(where.shape, np.uint8)
-    radius = max(radius_m * float(camera.intrinsics[0, 0]) / float(place[2]), 0.7)
-    cv2.circle(disc, (x, y), round(radius), 1, -1)
-    light[(disc > 0) & where] += colour
+    """Add the light of a lamp that is brightest in its middle to (H, W, 3), where it may be seen."""
+    x, y = camera.project(place.astype(np.float32)).tolist()
+    rows, columns = (np.arange(n, dtype=np.float32) for n in where.shape)
+    width = max(radius_m * float(camera.intrinsics[0, 0]) / float(place[2]), 0.7)
+    spot = np.exp(-np.square((rows - y) / (0.7 * width)) / 2)[:, None] * np.exp(
+        -np.square((columns - x) / width) / 2
+    )
+    light += np.where(where, spot, 0)[..., None] * colour.astype(np.float32)
 
 
 def _draw_streak(mirrored: Array, place: Array, below: Array, camera: PictureCamera, colour: Array) -> None:
