@@ -40,6 +40,7 @@ def build_order(config: SynthConfig) -> Order:
         people=not virtual if config.people is None else config.people,
         cameras=config.cameras,
         validation=config.validation,
+        night=config.night,
         edits=None if config.edits is None else Path(config.edits),
         meshes=None if config.meshes is None else Path(config.meshes),
         assets=None if config.assets is None else Path(config.assets),

@@ -437,6 +437,8 @@ class SynthConfig(FrameCommandConfig):
     """Number of cameras; 2 adds the right camera of Virtual KITTI 2."""
     validation: Annotated[float, NumberRange(0, 1, "[)", "a fraction in [0, 1)")] = 0.0
     """Fraction of the frames in part val, with shapes that part train does not contain."""
+    night: Annotated[float, NumberRange(0, 1, "[]", "a fraction in [0, 1]")] = 0.0
+    """Fraction of the streets by night: lamps, lit windows, some in rain."""
     edits: str | None = None
     """YAML file of changes to the scenes: vehicles, weather, foliage."""
     meshes: str | None = None

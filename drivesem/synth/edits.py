@@ -23,7 +23,8 @@ import numpy as np
 import torch
 
 from drivesem.config.edits import ALL, Edits, FrameEdit, ObjectEdit, read_edits
-from drivesem.synth.frames import Plan
+from drivesem.synth.frames import Plan, stream
+from drivesem.synth.lamps import darken, lamps_on, open_lens
 from drivesem.synth.layout import Actor
 from drivesem.synth.light import Light
 from scene_ir.errors import RangeError
@@ -31,11 +32,16 @@ from scene_ir.ffd import from_symmetric
 from scene_ir.render.environment import low_sun_share, move_sun, time_gain
 from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, SUN_STRENGTH
 from scene_ir.render.texture import apply_texture_code
+from scene_ir.types import Weather
 
-__all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "read_edits"]
+__all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "draw_night", "read_edits"]
 
 _GAMMA = 2.2
 """Display values to linear light."""
+DRAWN_WEATHER = (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST, Weather.NIGHT)
+"""Codes of weather that the generator draws."""
+_WET_NIGHTS, _BRAKING, _UNLIT = 0.3, 0.25, 0.03
+"""Shares of nights in rain, and of drivers who brake or have no lamps on."""
 
 
 def apply_edits(plan: Plan, edits: Edits, frame: int) -> Plan:
@@ -45,6 +51,26 @@ def apply_edits(plan: Plan, edits: Edits, frame: int) -> Plan:
         if key in edits:
             plan = apply_edit(plan, edits[key], f"frame {key}")
     return plan
+
+
+def draw_night(plan: Plan, share: float) -> Plan:
+    """The plan, by night in a share of streets: under other clouds, some in rain; of drivers who stand or drive, some
+    brake and a few have forgotten their lamps.
+    """
+    seed, street, attempt = plan.origin
+    rng = stream(seed, street, plan.split, 16 * attempt + 7)
+    if rng.random() >= share:
+        return plan
+    rain = float(rng.uniform(0.3, 1.0)) if rng.random() < _WET_NIGHTS else 0.0
+    weather = [0.0] * len(Weather)
+    weather[Weather.NIGHT], weather[Weather.RAIN] = float(rng.uniform(0.75, 1.0)), rain
+    weather[Weather.OVERCAST] = float(rng.uniform(0.5, 1.0)) if rain else float(rng.uniform(0.0, 1.0))
+    lamps: dict[int | str, ObjectEdit] = {}
+    for actor in plan.actors:
+        chance, amount = float(rng.random()), float(rng.uniform(0.3, 1.0))
+        if not actor.parked and chance < _BRAKING + _UNLIT:
+            lamps[actor.track] = ObjectEdit(lamps=amount if chance < _BRAKING else -1.0)
+    return apply_edit(plan, FrameEdit(objects=lamps, weather=tuple(weather)))
 
 
 def apply_edit(plan: Plan, edit: FrameEdit, where: str = "edit") -> Plan:
@@ -62,13 +88,14 @@ def apply_edit(plan: Plan, edit: FrameEdit, where: str = "edit") -> Plan:
         if changed is not None:
             actors.append(changed)
     light = _weathered(_under_sun(plan.setting.light, edit.sun), edit.weather)
-    response = plan.setting.response
-    rain = edit.weather[1]
+    response = open_lens(plan.setting.response, light.night)
+    rain = edit.weather[Weather.RAIN]
     if rain > 0:
         response = replace(response, streaks=min(response.streaks + 0.8 * rain, 1.0))
     foliage = tuple(a + b for a, b in zip(plan.foliage, edit.foliage, strict=True))
     setting = replace(plan.setting, light=light, response=response)
-    return replace(plan, actors=tuple(actors), setting=setting, foliage=foliage)
+    on = max(plan.drivers_lamps, lamps_on(edit.weather))
+    return replace(plan, actors=tuple(actors), setting=setting, foliage=foliage, drivers_lamps=on)
 
 
 def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
@@ -94,6 +121,7 @@ def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
         paint=_painted(actor.paint, edit.color),
         ffd=bent,
         size_lhw=(long, high, wide),
+        lamps=max(-1.0, min(actor.lamps + edit.lamps, 1.0)),
     )
 
 
@@ -124,21 +152,21 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
     """Light under a weather code: physical counterparts of what the compositor does to the picture."""
     if not any(code):
         return light
-    fog, rain, _, overcast, night, snow = code
-    if night:
-        raise RangeError("weather.night", "0, since generated streets are drawn by daylight", night)
-    if snow:
-        raise RangeError("weather.snow", "0, since no snow falls in generated streets", snow)
+    for weather in Weather:
+        if code[weather] and weather not in DRAWN_WEATHER:
+            name = f"weather.{weather.name.lower()}"
+            raise RangeError(name, "0, since generated streets are drawn without it", code[weather])
+    fog, rain, time, overcast = (code[w] for w in (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST))
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
-    codes = torch.tensor(code, dtype=torch.float64)
-    daylight = (1 + time_gain(codes[2], low_sun_share(codes[0], codes[1], codes[3])).numpy()) ** _GAMMA
+    low_sun = low_sun_share(*(torch.tensor(value, dtype=torch.float64) for value in (fog, rain, overcast)))
+    daylight = (1 + time_gain(torch.tensor(time, dtype=torch.float64), low_sun).numpy()) ** _GAMMA
 
     def toward(value: np.ndarray, target: np.ndarray | float) -> np.ndarray:
         return (value + cover * (target - value)) * daylight
 
     sun_lost = light.sun_colour * max(float(light.sun @ light.up), 0.0)
-    return replace(
+    light = replace(
         light,
         sun_colour=light.sun_colour * (1 - cover) * daylight,
         zenith=toward(light.zenith, 0.8 * grey),
@@ -148,3 +176,4 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
         haze_per_m=light.haze_per_m + FOG_EXTINCTION_PER_M * fog + RAIN_EXTINCTION_PER_M * rain,
         wet=max(light.wet, rain),
     )
+    return darken(light, code)

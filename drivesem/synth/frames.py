@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from drivesem.data.ground_truth import occlusion_from_visible
-from drivesem.synth import kernels
+from drivesem.synth import kernels, lamps
 from drivesem.synth.assets import Sky, with_sky
 from drivesem.synth.layout import (
     Actor,
@@ -304,7 +304,7 @@ def stream(seed: int, index: int, split: str, name: int) -> np.random.Generator:
 class Plan:
     """A frame before it is rendered. actors stand on road; setting: camera, light and the rest. origin: seed,
     index of the street, attempt. variation: its name; time_s: since the drive began. foliage:
-    codes (3,) of hue, lightness, density.
+    codes (3,) of hue, lightness, density. drivers_lamps: how far in [0, 1] drivers have their lamps on.
     """
 
     actors: tuple[Actor, ...]
@@ -314,6 +314,7 @@ class Plan:
     variation: str = MIXED
     time_s: float = 0.0
     foliage: tuple[float, ...] = (0.0, 0.0, 0.0)
+    drivers_lamps: float = 0.0
 
 
 def plan_frame(
@@ -437,6 +438,22 @@ def build_street(plan: Plan) -> Street:
     return Street(_into_camera(leaved(static, plan.foliage), plan.setting.view), used)
 
 
+def _lit(plan: Plan, street: Soup, soups: list[Soup]) -> tuple[Soup, list[Soup], Setting, Setting]:
+    """Street and actors with their lamps as they are on, and the settings with all lamps and with those but actors'."""
+    setting = plan.setting
+    view, light = setting.view, setting.light
+    states = lamps.LampStates(light.night, plan.drivers_lamps)
+    street, rows = lamps.street_lamps(street, light, sum(plan.origin))
+    rows = np.concatenate([rows, lamps.own_lamps(view, light, states)])
+    found, lit = [rows], []
+    for actor, soup in zip(plan.actors, soups, strict=True):
+        yaw = yaw_in_camera(actor, view)
+        soup, own = lamps.vehicle_lamps(actor, soup, np.array([np.cos(yaw), 0.0, -np.sin(yaw)]), light.up, states)
+        lit.append(soup)
+        found.append(own)
+    return street, lit, replace(setting, lamps=np.concatenate(found)), replace(setting, lamps=rows)
+
+
 def render_frame(
     plan: Plan,
     with_background: bool = False,
@@ -450,8 +467,7 @@ def render_frame(
     setting, view = plan.setting, plan.setting.view
     seed, _, attempt = plan.origin
     surround = surround or build_street(plan)
-    street = surround.soup
-    soups = actor_soups(plan)
+    street, soups, setting, empty_setting = _lit(plan, surround.soup, actor_soups(plan))
     shadows = [Shadow(a.position_xz, a.yaw, a.size_lhw) for a in plan.actors]
     world = join([street, *soups])
     sight = see(world, view)
@@ -460,7 +476,7 @@ def render_frame(
         return None
     picture = render(sight, world, shadows, setting)
     plain = see(street, view) if with_background else None
-    empty = None if plain is None else render_without_actors(plain, picture, setting)
+    empty = None if plain is None else render_without_actors(plain, picture, empty_setting)
     behind = plain or sight
     closest = kernels.nearest(sight.depth)
     # Of an actor with no more than a few samples there is no truth, and so no instance. Owner -1, the sky, reads
@@ -490,6 +506,7 @@ def render_frame(
             "weather": setting.light.weather,
             "variation": plan.variation,
             "time_s": round(plan.time_s, 6),
+            **({"night": round(setting.light.night, 6)} if setting.light.night else {}),
             "vehicles": sorted(vehicles),
             **surround.used,
         },

@@ -32,6 +32,7 @@ def lamp(height_m: float, side: int) -> Soup:
     top = (0, -height_m - 0.35, side * 1.8)
     arm = stick((0, -height_m, 0), top, (0.04, 0.03), Material.METAL, _GREY, 5)
     head = ball((0, -height_m - 0.38, side * 2.0), (0.14, 0.07, 0.35), Material.METAL, _GREY * 1.3, 1)
+    head.pattern[:, 2] = 1.0
     return join([pole, foot, arm, head])
 
 
@@ -45,7 +46,7 @@ def _plate(outline: np.ndarray, height_m: float, out_m: float, albedo: np.ndarra
     n = len(outline)
     rim = np.stack([np.full(n, -out_m), -height_m - outline[:, 1], outline[:, 0]], axis=1)
     corners = np.stack([np.broadcast_to(rim[0], (n - 2, 3)), rim[1:-1], rim[2:]], axis=1)
-    face = make(corners, Material.FLAT, albedo, np.broadcast_to([-1.0, 0, 0], corners.shape))
+    face = make(corners, Material.FLAT, albedo, np.broadcast_to([-1.0, 0, 0], corners.shape), pattern=(1, 0, 0, 0))
     return tagged(face, Semantic.TRAFFIC_SIGN)
 
 
@@ -132,6 +133,7 @@ def sign(rng: np.random.Generator) -> Soup:
         )
     back = _plate(layers[0][0][::-1], middle, 0.038, _GREY)
     back.normals[:] = np.array([1.0, 0, 0], np.float32)
+    back.pattern[:, 0] = 0.0
     parts.append(back)
     return join(parts)
 
@@ -158,6 +160,7 @@ def traffic_light(rng: np.random.Generator, reach_m: float) -> Soup:
         for i in range(3):
             albedo = lamp_colours[i] if i == lit else lamp_colours[i] * 0.06
             lens = _moved(_plate(disc, foot + 0.78 - 0.3 * i, 0.225, albedo), 0.0, 0.0, z)
+            lens.pattern[:, 2] = i == lit
             parts.append(tagged(lens, Semantic.TRAFFIC_LIGHT))
             hood = _moved(box((0.14, 0.02, 0.24), Material.FLAT, _BLACK * 1.6), -0.27, -foot - 0.9 + 0.3 * i, z)
             parts.append(tagged(hood, Semantic.TRAFFIC_LIGHT))

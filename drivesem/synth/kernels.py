@@ -16,6 +16,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from drivesem.synth import lamps
 from drivesem.synth.layout import Road
 from drivesem.synth.light import (
     LEAF_DEPTH_M,
@@ -30,7 +31,17 @@ from drivesem.synth.light import (
     ground_light,
 )
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
-from drivesem.synth.view import BYTE_SUM_SCALE, SIZE, NoiseSet, Setting, Shadow, Sight, SunMaps, fine_matrix
+from drivesem.synth.view import (
+    BYTE_SUM_SCALE,
+    LAMP_NUMBERS,
+    SIZE,
+    NoiseSet,
+    Setting,
+    Shadow,
+    Sight,
+    SunMaps,
+    fine_matrix,
+)
 from scene_ir.raster.launch import launch, split_range, start_warp, threads
 from scene_ir.raster.simd import SIMD_OPTIONS, exp_, load, log_
 from scene_ir.raster.verbs import NEAR_M
@@ -68,6 +79,24 @@ NEAR = wp.constant(wp.float64(NEAR_M))
 RIM = wp.constant(wp.float32(0.5))
 """So far from the border of the near shadow map, m, nobody looks into the far one: more than its soft edges reach."""
 
+LAMP = wp.constant(LAMP_NUMBERS)
+STREET, BEAM = wp.constant(wp.float32(lamps.STREET)), wp.constant(wp.float32(lamps.BEAM))
+BEAM_WIDE, BEAM_CUT, BEAM_EDGE, BEAM_DOWN, BEAM_FLOOD, FLOOD_WIDE, BEAM_STRAY = (
+    wp.constant(wp.float32(v))
+    for v in (
+        *(lamps.BEAM_WIDE, lamps.BEAM_CUT, lamps.BEAM_EDGE, lamps.BEAM_DOWN),
+        *(lamps.BEAM_FLOOD, lamps.FLOOD_WIDE, lamps.BEAM_STRAY),
+    )
+)
+RETRO, RETRO_RAD, ROUGH, LAMP_SIZE = (
+    wp.constant(wp.float32(v)) for v in (lamps.RETRO, lamps.RETRO_RAD, lamps.ROUGH, lamps.LAMP_SIZE_M)
+)
+WET_ROUGH, PUDDLE_ROUGH, COAT_ROUGH, BRIGHTEST_GLINT = (
+    wp.constant(wp.float32(v))
+    for v in (lamps.WET_ROUGH, lamps.PUDDLE_ROUGH, lamps.COAT_ROUGH, lamps.BRIGHTEST_GLINT)
+)
+WARM, COOL = (wp.constant(wp.vec3f(*rgb)) for rgb in (lamps.WINDOW_RGB, lamps.WINDOW_COOL))
+WINDOW_FROM, WINDOW_SLOPE = (wp.constant(wp.float32(v)) for v in (lamps.WINDOW_FROM, lamps.WINDOW_SLOPE))
 M_SKY, M_ROAD, M_PARKING, M_PAVEMENT, M_KERB, M_GRASS, M_GRAVEL = (wp.constant(int(m)) for m in list(Material)[:7])
 M_FACADE, M_ROOF, M_WALL, M_FENCE, M_LEAF, M_BARK, M_METAL = (wp.constant(int(m)) for m in list(Material)[7:14])
 M_FLAT, M_PAINT, M_GLASS, M_TYRE, M_LIGHT, M_TRIM = (wp.constant(int(m)) for m in list(Material)[14:20])
@@ -87,7 +116,7 @@ class Noise:
 
 @wp.struct
 class Air:
-    """`Light`, and what follows from it. right, forward: azimuths 90 degrees and 0."""
+    """`Light`, and what follows from it. right, forward: azimuths 90 degrees and 0. lamps: `Setting.lamps`, flat."""
 
     sun: wp.vec3f
     up: wp.vec3f
@@ -109,6 +138,9 @@ class Air:
     panorama_height: wp.int32
     panorama_width: wp.int32
     panorama_turn: wp.float32
+    night: wp.float32
+    lamps: Floats
+    lamp_count: wp.int32
 
 
 @wp.struct
@@ -167,7 +199,8 @@ class Shade:
 
 @wp.struct
 class Spot:
-    """One sample: the reference's `Samples`."""
+    """One sample: the reference's `Samples`. retro: 1 where it sends light back to its source, else 0; rough: 1 for
+    ground, else 0."""
 
     point: wp.vec3f
     world: wp.vec3f
@@ -180,6 +213,9 @@ class Spot:
     open_sky: wp.float32
     pixel_m: wp.float32
     along_px: wp.float32
+    retro: wp.float32
+    rough: wp.float32
+    owner: wp.float32
 
 
 # ------------------------------------------------------------------------------------------------------- noise, light
@@ -403,6 +439,88 @@ def fifth(x: float):
 
 
 @wp.func
+def beam_share(ahead: float, rise: float):
+    """`lamps.beam_share` of a direction by its cosines to the beam's axis and to the vertical."""
+    aside = wp.sqrt(wp.max(1.0 - ahead * ahead - rise * rise, 0.0)) / wp.max(ahead, 1e-3)
+    below = saturate((-rise - BEAM_CUT) / BEAM_EDGE + 0.5)
+    narrow = aside / BEAM_WIDE
+    wide = aside / FLOOD_WIDE
+    core = exp_(-narrow * narrow - wp.max(-rise - 0.03, 0.0) / BEAM_DOWN)
+    return saturate(4.0 * ahead) * (below * (core + BEAM_FLOOD * exp_(-wide * wide)) + BEAM_STRAY)
+
+
+@wp.func
+def lamp_light(s: Spot, air: Air, i: int):
+    """Irradiance at right angles from lamp i, by colour; none of a vehicle's own lamps on itself."""
+    at = i * LAMP
+    if load(air.lamps, at + 10) == s.owner:
+        return wp.vec3f()
+    to = wp.vec3f(load(air.lamps, at), load(air.lamps, at + 1), load(air.lamps, at + 2)) - s.point
+    square = wp.dot(to, to)
+    away = -to / wp.sqrt(square + 1e-9)
+    axis = wp.vec3f(load(air.lamps, at + 3), load(air.lamps, at + 4), load(air.lamps, at + 5))
+    ahead = wp.dot(away, axis)
+    kind = load(air.lamps, at + 9)
+    share = saturate(ahead)
+    if kind == STREET:
+        share = saturate(ahead * 4.0)
+    elif kind == BEAM:
+        share = beam_share(ahead, wp.dot(away, air.up))
+    colour = wp.vec3f(load(air.lamps, at + 6), load(air.lamps, at + 7), load(air.lamps, at + 8))
+    return colour * (share / (square + LAMP_SIZE * LAMP_SIZE))
+
+
+@wp.func
+def towards_lamp(s: Spot, air: Air, i: int):
+    at = i * LAMP
+    return wp.normalize(wp.vec3f(load(air.lamps, at), load(air.lamps, at + 1), load(air.lamps, at + 2)) - s.point)
+
+
+@wp.func
+def lamplight(s: Spot, air: Air):
+    """What matt surfaces get from all lamps."""
+    total = wp.vec3f()
+    back = -wp.normalize(s.point)
+    seen = saturate(wp.dot(s.normal, back))
+    for i in range(air.lamp_count):
+        to = towards_lamp(s, air, i)
+        slope = wp.dot(s.normal, to)
+        if slope > 0.0:
+            gain = slope
+            if s.rough > 0.0:
+                gain *= s.open_sky * (1.0 - ROUGH + ROUGH / wp.max(slope + seen, 1e-3))
+            if s.retro > 0.0:
+                off = (1.0 - wp.dot(to, back)) * 2.0 / (RETRO_RAD * RETRO_RAD)
+                gain *= 1.0 + RETRO / (1.0 + off)
+            total += lamp_light(s, air, i) * gain
+    return total
+
+
+@wp.func
+def glints(s: Spot, air: Air, rough: float, reflectance: float):
+    """Radiance of all lamps in a coat whose microfacets' slopes have the width `rough` (Trowbridge and Reitz)."""
+    total = wp.vec3f()
+    back = -wp.normalize(s.point)
+    seen = wp.max(wp.dot(s.normal, back), 1e-3)
+    square = rough * rough
+    for i in range(air.lamp_count):
+        to = towards_lamp(s, air, i)
+        slope = wp.dot(s.normal, to)
+        if slope > 0.0:
+            half = wp.normalize(to + back)
+            cosine = saturate(wp.dot(s.normal, half))
+            spread = cosine * cosine * (square - 1.0) + 1.0
+            fresnel = reflectance + (1.0 - reflectance) * fifth(1.0 - saturate(wp.dot(half, back)))
+            masked = 2.0 * slope * seen * (1.0 - rough) + (slope + seen) * rough
+            # radiance is per irradiance on white, without pi
+            weight = square / (spread * spread) * 0.5 / masked * fresnel * slope
+            total += lamp_light(s, air, i) * weight
+    return wp.vec3f(
+        wp.min(total[0], BRIGHTEST_GLINT), wp.min(total[1], BRIGHTEST_GLINT), wp.min(total[2], BRIGHTEST_GLINT)
+    )
+
+
+@wp.func
 def facade(s: Spot, air: Air, textures: Noise, incoming: wp.vec3f):
     """Radiance of a wall with windows: `_facade` of the reference, lit."""
     pitch = s.pattern[0]
@@ -441,12 +559,14 @@ def facade(s: Spot, air: Air, textures: Noise, incoming: wp.vec3f):
     sill = fraction(row / storey) - 0.5
     inside *= wp.clamp(1.0 - 1.4 * sill / wp.max(tall, 0.1), 0.3, 1.0)
     albedo += (wp.vec3f(1.0, 0.97, 0.92) * inside - albedo) * pane
+    room = WARM + (COOL - WARM) * (0.5 + 0.5 * wp.sin(40.0 * cell))
+    room *= saturate((cell - WINDOW_FROM) * WINDOW_SLOPE) * wp.clamp(1.0 + sill, 0.5, 1.5) * (pane * air.night)
     view = wp.normalize(s.point)
     cosine = saturate(-wp.dot(view, s.normal))
     mirror = view + s.normal * (2.0 * cosine) + air.up * (0.02 * cell)
     fresnel = 0.06 + 0.94 * fifth(1.0 - cosine)
     glare = reflected_radiance(air, textures, mirror, False) * (fresnel * pane * 0.8)
-    return wp.cw_mul(albedo, incoming) + glare
+    return wp.cw_mul(albedo, incoming) + glare + room
 
 
 @wp.func
@@ -455,7 +575,10 @@ def irradiance(s: Spot, air: Air):
     slope = saturate(wp.dot(s.normal, air.sun)) * s.lit
     sky = (0.5 + 0.5 * facing) * s.open_sky
     ground = (0.5 - 0.5 * facing) * s.open_sky
-    return air.sun_colour * slope + air.ambient * sky + air.bounce * ground
+    total = air.sun_colour * slope + air.ambient * sky + air.bounce * ground
+    if air.lamp_count > 0:
+        total += lamplight(s, air)
+    return total
 
 
 @wp.func
@@ -471,6 +594,8 @@ def polish(s: Spot, air: Air, textures: Noise, base: wp.vec3f, gloss: wp.vec3f):
         fourth = square * square
         sharp = power(glint, gloss[2]) * 14.0 + fourth * fourth * fourth * 0.25
         out += air.sun_colour * (sharp * fresnel * s.lit)
+    if air.lamp_count > 0:
+        out += glints(s, air, COAT_ROUGH, gloss[0]) * gloss[1]
     return base + out
 
 
@@ -528,7 +653,7 @@ def surface(s: Spot, material: int, air: Air, street: StreetMarkings, textures: 
             gloss = wp.vec3f(0.03, 0.4, 60.0)
         else:
             base *= 0.9
-        return polish(s, air, textures, wp.cw_mul(base, incoming), gloss)
+        return polish(s, air, textures, wp.cw_mul(base, incoming), gloss) + s.albedo * s.pattern[1]
     if material == M_KERB:
         tone += 0.12 * noise(textures.soft, s.u, s.v, 1.0 / 0.05) - 0.35 * (
             1.0 - pulse(s.v, 1.0, 0.98, s.along_px)
@@ -576,6 +701,8 @@ def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: StreetMarkin
         hidden = 0.25 + 0.75 * s.open_sky
         mirror = view + s.normal * (2.0 * cosine)
         out = out * (1.0 - share) + reflected_radiance(air, textures, mirror, True) * (share * hidden)
+        if air.lamp_count > 0:
+            out += glints(s, air, WET_ROUGH + (PUDDLE_ROUGH - WET_ROUGH) * puddle, 0.02) * (film * hidden)
     return out
 
 
@@ -685,6 +812,7 @@ def pixel_kernel(
     shade: Shade,
     wanted: Bytes,
     out: Vec3s,
+    shining: Vec3s,
     touched: Bytes,
 ):
     # A row a thread: structures are copied once a row.
@@ -712,6 +840,7 @@ def pixel_kernel(
                         once = wp.max(first) < wp.min(first) * 1.03
             count = wp.where(once, 1, 4)
             total = wp.vec3f()
+            beyond = wp.vec3f()
             for k in range(count):
                 dy = k // 2
                 dx = k - 2 * dy
@@ -746,6 +875,16 @@ def pixel_kernel(
                     sky = open_sky(s.world, on_ground, actor, shade)
                     if lit[1] + sky[1] > 0.0:
                         changed = 1
+                    s.rough = float(0.0)
+                    s.retro = float(0.0)
+                    if on_ground:
+                        s.rough = 1.0
+                    elif material >= M_METAL and material <= M_TRIM:
+                        if s.pattern[0] + s.pattern[3] > 0.0:
+                            s.retro = 1.0
+                    s.owner = float(scene.owner[at])
+                    if scene.owner[at] == 0:
+                        s.owner = -1.0
                     s.lit = lit[0]
                     s.open_sky = sky[0]
                     s.pixel_m = s.point[2] / lens.focal
@@ -760,8 +899,12 @@ def pixel_kernel(
                 elif air.fog == 0:
                     colour = sky_radiance(air, textures, wp.normalize(ray))
                 for axis in range(3):
-                    total[axis] += apply_tone_curve(colour[axis] * lens.develop[axis], lens.curve)
+                    exposed = colour[axis] * lens.develop[axis]
+                    total[axis] += apply_tone_curve(exposed, lens.curve)
+                    beyond[axis] += wp.max(exposed - 1.0, 0.0)
             out[i] = total * (1.0 / float(count))
+            if air.lamp_count > 0:
+                shining[i] = beyond * (1.0 / float(count))
         touched[i] = wp.uint8(changed)
 
 
@@ -1198,7 +1341,7 @@ def _noise(textures: NoiseSet) -> Noise:
     return out
 
 
-def _air(light: Light) -> Air:
+def _air(light: Light, lamp_rows: np.ndarray) -> Air:
     air = Air()
     right, forward = light.ahead
     air.sun, air.up, air.right, air.forward = _vec(light.sun), _vec(light.up), _vec(right), _vec(forward)
@@ -1208,6 +1351,7 @@ def _air(light: Light) -> Air:
     air.tarmac = _vec(MIRRORED_GROUND * (light.ambient + 0.6 * light.sun_colour))
     air.haze, air.clouds, air.cloud_seed = light.haze_per_m, light.clouds, light.cloud_seed
     air.wet, air.fog = light.wet, int(light.weather == "fog")
+    air.night, air.lamps, air.lamp_count = light.night, _flat(lamp_rows), len(lamp_rows)
     if light.panorama is not None:
         pixels = light.panorama.pixels
         air.panorama = _flat(pixels)
@@ -1244,12 +1388,12 @@ def develop_pixels(
     setting: Setting,
     maps: SunMaps | None,
     shadows: list[Shadow],
-    target: tuple[np.ndarray, np.ndarray],
+    target: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Fill in display values. target: the image (H * W, 3) float32 to fill and the pixels (H * W,) bool to do.
-    Returns the pixels (H * W,) bool that actors touch.
+    """Fill in display values. target: the image (H * W, 3) float32 to fill, the pixels (H * W,) bool to do, and the
+    light beyond white (H * W, 3) float32 to fill where lamps are on. Returns the pixels (H * W,) bool that actors touch.
     """
-    image, wanted = target
+    image, wanted, shining = target
     seen, view = sight.faces, setting.view
     scene = PixelArrays()
     table = np.empty((max(len(seen), 1), TABLE), np.float32)
@@ -1276,11 +1420,11 @@ def develop_pixels(
     else:
         shade = _shade(maps.rows, maps.depth, maps.areas, prints)
     touched = np.empty(len(image), bool)
-    inputs = [scene, _air(setting.light), _street(setting.road), _noise(setting.noise), lens, shade]
+    inputs = [scene, _air(setting.light, setting.lamps), _street(setting.road), _noise(setting.noise), lens, shade]
     launch(
         pixel_kernel,
         _rows(view.camera.height),
-        [*inputs, _flat(wanted), _flat(image, wp.vec3f), _flat(touched)],
+        [*inputs, _flat(wanted), _flat(image, wp.vec3f), _flat(shining, wp.vec3f), _flat(touched)],
         device=torch.device("cpu"),
     )
     return touched

@@ -219,7 +219,7 @@ class Actor:
     """A vehicle or person. position_xz, yaw: world; size_lhw m; paint: linear albedo; seed: of its own details.
     lane_ds: road coordinates (d, s) m where it follows the road, speed_mps: along s, below 0 against it. track:
     its number within the scene. ffd: lattice offsets (192,) that bend its shape, as fractions of the unit box, or
-    None.
+    None. lamps: code in [-1, 1]: off, as the weather makes drivers do it, brake lamps.
     """
 
     kind: str
@@ -235,6 +235,7 @@ class Actor:
     track: int = 0
     ffd: tuple[float, ...] | None = None
     mesh: VehicleMesh | None = None
+    lamps: float = 0.0
 
     @property
     def model(self) -> str:

@@ -32,7 +32,8 @@ class Light:
     """Light of a frame, in camera axes. sun (3,): towards the sun; up (3,): the ground's normal. Colours (3,) are
     linear radiance or irradiance where sunlit white is about 1. haze_per_m: extinction. clouds: cover in [0, 1].
     wet: how much water lies on the ground, in [0, 1]. panorama: the sky, instead of gradient and clouds. heading:
-    rad that the camera is turned to the right of where clouds, skyline and panorama have azimuth 0.
+    rad that the camera is turned to the right of where clouds, skyline and panorama have azimuth 0. night: share of
+    night in [0, 1], by which windows are lit.
     """
 
     weather: str
@@ -48,6 +49,7 @@ class Light:
     wet: float = 0.0
     panorama: Panorama | None = None
     heading: float = 0.0
+    night: float = 0.0
 
     @property
     def ahead(self) -> tuple[np.ndarray, np.ndarray]:

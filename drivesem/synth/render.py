@@ -5,13 +5,14 @@ Kernels compute it. Plain numpy in `tests/drivesem/synth/reference_*.py` defines
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 
 from drivesem.synth import kernels
+from drivesem.synth.light import develop
 from drivesem.synth.soup import Soup
 from drivesem.synth.view import SHADOW_VIEWS_M, SUPERSAMPLING, Setting, Shadow, Sight, SunMaps, View, fine_matrix
 from scene_ir.raster import verbs
@@ -23,12 +24,14 @@ SHADOW_TEXELS = 1024
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A render. image (H, W, 3) uint8; developed (H * W, 3) float32, before lens and sensor; touched (H * W,)
-    bool, pixels that actors or their shadows change; sun_maps: shadow maps it used.
+    """A render. image (H, W, 3) uint8; developed (H * W, 3) float32, before lens and sensor; shining (H * W, 3)
+    float32: light beyond white; touched (H * W,) bool, pixels that actors, their shadows or lamps change; sun_maps:
+    shadow maps it used.
     """
 
     image: np.ndarray
     developed: np.ndarray
+    shining: np.ndarray
     touched: np.ndarray
     sun_maps: SunMaps | None
 
@@ -91,10 +94,10 @@ def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) ->
     """Photograph a world. sight: of the soup; shadows: of the actors in it."""
     maps = sun_maps(soup, setting)
     pixels = setting.view.camera.height * setting.view.camera.width
-    developed = np.empty((pixels, 3), np.float32)
-    touched = kernels.develop_pixels(sight, setting, maps, shadows, (developed, np.ones(pixels, bool)))
-    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting)
-    return Picture(image, developed, touched, maps)
+    developed, shining = np.empty((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
+    touched = kernels.develop_pixels(sight, setting, maps, shadows, (developed, np.ones(pixels, bool), shining))
+    touched |= bool((setting.lamps[:, -1] > 0).any())
+    return Picture(_photograph(developed, shining, setting), developed, shining, touched, maps)
 
 
 def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Picture:
@@ -106,10 +109,33 @@ def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Pict
         depth = maps.depth.copy()
         depth[:, 1] = np.inf
         maps = SunMaps(maps.rows, depth)
-    developed = full.developed.copy()
-    kernels.develop_pixels(sight, setting, maps, [], (developed, full.touched))
-    image = take(developed.reshape(setting.view.camera.height, -1, 3), setting)
-    return Picture(image, developed, np.zeros_like(full.touched), maps)
+    developed, shining = full.developed.copy(), full.shining.copy()
+    kernels.develop_pixels(sight, setting, maps, [], (developed, full.touched, shining))
+    image = _photograph(developed, shining, setting)
+    return Picture(image, developed, shining, np.zeros_like(full.touched), maps)
+
+
+def _photograph(developed: np.ndarray, shining: np.ndarray, setting: Setting) -> np.ndarray:
+    """The photograph (H, W, 3) uint8 of display values and of light beyond white, each (H * W, 3)."""
+    shape = (setting.view.camera.height, setting.view.camera.width, 3)
+    return take(with_glare(developed.reshape(shape), shining.reshape(shape), setting), setting)
+
+
+def with_glare(image: np.ndarray, shining: np.ndarray, setting: Setting) -> np.ndarray:
+    """Display values (H, W, 3) with the light that lens and air scatter around what shines brighter than white."""
+    if not shining.any():
+        return image
+    height, light = image.shape[0], setting.light
+    air = 1 + light.haze_per_m * _GLARE_M
+    glare = np.zeros_like(image)
+    for i, (across, down, share) in enumerate(_GLARE):
+        glare += cv2.GaussianBlur(shining, (0, 0), across * height, sigmaY=down * height) * (
+            share * (air if i else 1)
+        )
+    plain = replace(setting.response, exposure=1.0, white_balance=np.ones(1))
+    linear = np.minimum(image, _WHITE) ** np.float32(2.2 / plain.contrast)
+    fourth = np.square(np.square(linear))
+    return develop(linear / np.sqrt(np.sqrt(1 - fourth)) + glare, plain).astype(np.float32)
 
 
 def take(image: np.ndarray, setting: Setting) -> np.ndarray:
@@ -123,7 +149,8 @@ def through_lens(image: np.ndarray, setting: Setting) -> np.ndarray:
     image = _fringed(image, response.chromatic_px) if response.chromatic_px > 0 else image
     out = cv2.GaussianBlur(image, (5, 5), response.blur_px)
     if response.streaks > 0:
-        _streak(out, response.streaks, np.random.default_rng([*setting.grain_seed, 0x5A1]))
+        brightness = _STREAK_BRIGHTNESS + (_STREAK_BY_NIGHT - _STREAK_BRIGHTNESS) * setting.light.night
+        _streak(out, response.streaks, brightness, np.random.default_rng([*setting.grain_seed, 0x5A1]))
     return out
 
 
@@ -150,11 +177,19 @@ def _fringed(image: np.ndarray, shift_px: float) -> np.ndarray:
 
 _STREAKS = ((520, (6.0, 18.0), 1, 0.10), (130, (18.0, 46.0), 1, 0.16), (16, (50.0, 110.0), 2, 0.14))
 """Rain at three distances: streaks in an image of KITTI's size, lengths px, thickness px, opacity."""
-_STREAK_BRIGHTNESS = 0.85
-"""Display value of a drop: what lies behind, upside down, mostly sky."""
+_STREAK_BRIGHTNESS, _STREAK_BY_NIGHT = 0.85, 0.28
+"""Display value of a drop: what lies behind, upside down, mostly sky; by night it is lit by lamps."""
+_GLARE = ((0.004, 0.004, 0.10), (0.014, 0.014, 0.05), (0.07, 0.07, 0.03), (0.06, 0.0016, 0.006))
+"""Glare of lens and windscreen: standard deviations across and down, in heights of the picture, and shares; the last
+is the streak of wipers.
+"""
+_GLARE_M = 150.0
+"""Haze of one over this length doubles the glare, except for the narrowest."""
+_WHITE = np.float32(0.998)
+"""Display value from which a pixel counts as just white, where glare is added."""
 
 
-def _streak(image: np.ndarray, amount: float, rng: np.random.Generator) -> None:
+def _streak(image: np.ndarray, amount: float, brightness: float, rng: np.random.Generator) -> None:
     """Draw falling drops, blurred by their speed, over display values (H, W, 3), in place: they show the sky."""
     height, width = image.shape[:2]
     slant = float(rng.normal(0, 0.12))
@@ -173,4 +208,4 @@ def _streak(image: np.ndarray, amount: float, rng: np.random.Generator) -> None:
             cv2.line(layer, a.tolist(), b.tolist(), float(255 * value), thickness, cv2.LINE_AA, 4)
         veil += layer * np.float32(opacity * (0.5 + 0.5 * amount) / 255)
     veil = cv2.GaussianBlur(veil, (3, 3), 0.6)[..., None]
-    image += (np.float32(_STREAK_BRIGHTNESS) - image) * veil
+    image += (np.float32(brightness) - image) * veil

@@ -78,7 +78,8 @@ GROUND = (Material.ROAD, Material.PARKING, Material.PAVEMENT, Material.KERB, Mat
 @dataclass(frozen=True, slots=True)
 class Soup:
     """F independent triangles. corners (F, 3, 3) m; normals (F, 3, 3) unit, one a corner; uv (F, 3, 2) m, surface
-    coordinates for patterns; material (F,) uint8; albedo (F, 3) linear RGB; pattern (F, 4), meaning by material;
+    coordinates for patterns; material (F,) uint8; albedo (F, 3) linear RGB; pattern (F, 4), meaning by material (of
+    METAL to TRIM: retro-reflective, own radiance per albedo, whether it shines by night, cell of a plate);
     owner (F,) int32, 0 is the surroundings, i + 1 actor i; semantic (F,) uint8, a `Semantic`. All float32 unless
     stated.
     """

@@ -33,6 +33,8 @@ _AMBER, _CLEAR = np.array([0.42, 0.15, 0.015], np.float32), np.array([0.42, 0.42
 _CHROME, _HOUSING = np.array([0.30, 0.30, 0.31], np.float32), np.array([0.10, 0.10, 0.105], np.float32)
 _SIGNS = 7
 """Characters on a number plate."""
+_PLATE = 255
+"""Cell of what belongs to a plate but to no character."""
 _SEAT_M = 0.37
 """How far to the side of the middle the front seats stand."""
 _GREY_TO_LINEAR = 2.2
@@ -71,7 +73,7 @@ def _mean(values: np.ndarray) -> np.ndarray:
 class _Pieces:
     """n triangles that lie in the faces of a mesh. parent (n,): their face; share (n, 3, 3): barycentric
     coordinates of each corner in it; material (n,) uint8; albedo (n, 3) float32; cell (n,): 1 + stroke of a
-    plate's character, or 0.
+    plate's character, `_PLATE` for the rest of a plate, or 0.
     """
 
     parent: np.ndarray
@@ -117,7 +119,7 @@ class VehicleShape:
     """A vehicle in the unit box: n triangles that lie in the faces of a mesh. vertices (V, 3), faces (F, 3),
     normals (F, 3, 3): of the mesh, and of its faces' corners; parent (n,) int32, share (n, 3, 3): as in
     `_Pieces`; material (n,) uint8; albedo (n, 3), paint in a neutral tint; cell (n,) uint8: 1 + stroke of a
-    plate's character that may darken it, or 0.
+    plate's character that may darken it, 255 for the rest of a plate, or 0.
     """
 
     vertices: np.ndarray
@@ -194,6 +196,7 @@ def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
     colour = _PLATE_YELLOW if yellow else _PLATE_WHITE
     # the mean of the ground and the characters
     pieces.albedo[:] = colour * 0.72
+    pieces.cell[:] = _PLATE
     if not fine:
         return pieces
     facing, middle = pieces.facing(base)[:, 0], pieces.middle(base)[:, 0]
@@ -218,7 +221,7 @@ def _plates(base: _Base, pieces: _Pieces, yellow: bool, fine: bool) -> _Pieces:
         column, row = np.searchsorted(edges, u) - 1, np.searchsorted(rows, v) - 1
         sign, half = np.divmod(column, 3)
         stroke = (column >= 0) & (half < 2) & (row >= 0) & (row < 2)
-        part.cell[:] = np.where(stroke, 1 + (2 * sign + half) * 2 + row, 0)
+        part.cell[:] = np.where(stroke, 1 + (2 * sign + half) * 2 + row, _PLATE)
         found.append(part)
     return _joined(found)
 
@@ -507,9 +510,10 @@ def vehicle_shape(kind: str, variant: int, fine: bool) -> VehicleShape:
 
 @lru_cache(maxsize=512)
 def _strokes(seed: int) -> np.ndarray:
-    """Whether each cell of a plate's characters is dark, (1 + 4 * signs,) bool; cell 0 never."""
+    """Whether each cell is dark, (256,) bool: only strokes of a plate's characters may be."""
     rng = np.random.default_rng([0x91A, seed])
-    dark = rng.random(1 + 4 * _SIGNS) < 0.72
+    dark = np.zeros(_PLATE + 1, bool)
+    dark[: 1 + 4 * _SIGNS] = rng.random(1 + 4 * _SIGNS) < 0.72
     dark[0] = False
     # spaces between the town, the letters and the number
     sign = int(rng.integers(1, 4))

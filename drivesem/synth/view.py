@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -14,6 +14,8 @@ from scene_ir.types import Camera
 
 SUPERSAMPLING = 2
 """Samples a pixel along each axis."""
+LAMP_NUMBERS = 11
+"""In a row of `Setting.lamps`."""
 SHADOW_VIEWS_M = ((-15.0, 15.0, 1.0, 31.0), (-56.0, 56.0, -2.0, 110.0))
 """Rectangles (x0, x1, z0, z1) of the ground that the near and the far shadow map cover, m to the right and ahead
 of the camera."""
@@ -68,7 +70,9 @@ class Shadow:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What a frame is rendered with, apart from the triangles."""
+    """What a frame is rendered with, apart from the triangles. lamps (K, 11) float32: place, axis, colour times
+    intensity, kind, owner of each lamp that is on (see `lamps`), in camera axes about the centre of projection.
+    """
 
     view: View
     road: Road
@@ -76,6 +80,7 @@ class Setting:
     response: Response
     noise: NoiseSet
     grain_seed: tuple[int, ...]
+    lamps: np.ndarray = field(default_factory=lambda: np.zeros((0, LAMP_NUMBERS), np.float32))
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from drivesem.data.ground_truth import FrameLocation
 from drivesem.data.registry import WRITERS, DatasetWriter
 from drivesem.data.vkitti2 import Vkitti2Writer
 from drivesem.synth.assets import Assets, assets_from, meshes_in, of_split
-from drivesem.synth.edits import Edits, apply_edits, read_edits
+from drivesem.synth.edits import Edits, apply_edits, draw_night, read_edits
 from drivesem.synth.exposure import expose
 from drivesem.synth.frames import (
     GENERATOR_VERSION,
@@ -63,8 +63,8 @@ class Order:
     KITTI's names, or "mixed": weather of its own). layout: of `drivesem.data.registry.WRITERS`. split: pool of
     shapes, "train" or "heldout". sequence: frames of one drive. people: pedestrians and cyclists too. cameras: 2
     for Virtual KITTI 2's stereo. validation: share of the frames that belong to part "val", made of held-out
-    shapes. edits: a YAML file of `drivesem.synth.edits`. meshes, assets: folders of vehicles, of the optional
-    pack.
+    shapes. night: share of the streets drawn by night. edits: a YAML file of `drivesem.synth.edits`. meshes, assets:
+    folders of vehicles, of the optional pack.
     """
 
     out: Path
@@ -77,6 +77,7 @@ class Order:
     people: bool = True
     cameras: int = 1
     validation: float = 0.0
+    night: float = 0.0
     edits: Path | None = None
     meshes: Path | None = None
     assets: Path | None = None
@@ -92,6 +93,8 @@ class Order:
             raise RangeError("synth layout", f"one of {', '.join(WRITERS)}", self.layout)
         if not 0 <= self.validation < 1:
             raise RangeError("synth validation", "a share in [0, 1)", self.validation)
+        if not 0 <= self.night <= 1:
+            raise RangeError("synth night", "a share in [0, 1]", self.night)
         if self.cameras not in (1, 2) or (self.cameras == 2 and self.layout != "vkitti2"):
             raise RangeError("synth cameras", "1, or 2 in layout vkitti2", self.cameras)
         if self.people and self.layout.startswith("vkitti"):
@@ -109,6 +112,9 @@ class Order:
         """What decides on every byte of a frame; runs with another recipe do not go on in the same folder."""
         recipe = {k: v for k, v in asdict(self).items() if k not in ("out", "frames", "resume")}
         recipe["variations"] = list(self.variations)
+        if not self.night:
+            # as in recipes from before there was a night
+            del recipe["night"]
         if self.edits is not None:
             recipe["edits"] = hashlib.sha256(files.read_bytes(self.edits)).hexdigest()
         for name in ("meshes", "assets"):
@@ -221,7 +227,7 @@ def plan_job(job: Job) -> Plan:
     )
     attempt = _busy_attempt(order.seed, job.index - job.index % order.sequence, split, settings)
     plan = apply_variation(plan_frame(order.seed, job.index, split, settings, attempt), job.variation)
-    return apply_edits(plan, _read_edits(order.edits), job.index)
+    return apply_edits(draw_night(plan, order.night), _read_edits(order.edits), job.index)
 
 
 def make_frame(job: Job) -> int:

@@ -18,7 +18,7 @@ from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.errors import UsageError
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.synth.demo import demo_plan
-from drivesem.synth.edits import apply_edit
+from drivesem.synth.edits import DRAWN_WEATHER, apply_edit
 from drivesem.synth.frames import (
     GENERATOR_VERSION,
     Plan,
@@ -36,7 +36,7 @@ from drivesem.synth.write import Order, list_jobs, plan_job
 from scene_ir import ffd, files
 from scene_ir.derender.derender import VEHICLE_CATEGORIES
 from scene_ir.errors import FormatError
-from scene_ir.types import DAYLIGHT_DIM, LATTICE, SceneIR, Weather
+from scene_ir.types import LATTICE, SceneIR, Weather
 
 MANIFEST = "manifest.json"
 _GENERATED_RUN = "a run on generated frames: the embedded scenes, or drivesem synth --layout kitti"
@@ -132,6 +132,7 @@ def _order(root: Path, manifest: Mapping[str, Any]) -> Order:
         out=root,
         frames=len(manifest["frames"]) // len(variations),
         variations=variations,
+        night=manifest.get("night", 0.0),
         **{
             key: manifest[key]
             for key in ("seed", "layout", "split", "sequence", "people", "cameras", "validation")
@@ -172,8 +173,9 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
         bend = (after.ffd[i] - before.ffd[i]).detach().double()
         grown = float((after.size_lhw[i] / before.size_lhw[i]).mean()) - 1
         paint = (after.texture_code[i] - before.texture_code[i]).detach()
+        lamps = float(after.lamps[i] - before.lamps[i])
         if track is None:
-            if turn or grown or bool(move.any()) or bool(bend.any()) or bool(paint.any()):
+            if turn or grown or lamps or bool(move.any()) or bool(bend.any()) or bool(paint.any()):
                 missing.append(f"objects[{i}]: the generator's plan has no such vehicle")
             continue
         actor = actors[track]
@@ -185,17 +187,15 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
             color=tuple(paint.clamp(-1, 1).tolist()),
             mesh=tuple(ffd.to_symmetric(bend).tolist()) if bool(bend.any()) else (),
             size=grown,
+            lamps=max(-1.0, min(lamps, 1.0)),
         )
-    if not torch.equal(after.lamps, before.lamps):
-        missing.append("lamps: generated vehicles are drawn without")
     environment, then = changed.environment, still.environment
-    if bool(environment.weather[Weather.NIGHT] != then.weather[Weather.NIGHT]):
-        missing.append("night: generated streets are drawn by daylight")
-    if bool(environment.weather[Weather.SNOW] != then.weather[Weather.SNOW]):
-        missing.append("snow: no snow falls in generated streets")
+    weather = (environment.weather - then.weather).detach().clamp(0, 1).tolist()
+    undrawn = [code for code in Weather if code not in DRAWN_WEATHER and weather[code]]
+    missing += [f"{code.name.lower()}: generated streets are drawn without it" for code in undrawn]
     edit = FrameEdit(
         objects=edits,
-        weather=(*(environment.weather - then.weather).detach().clamp(0, 1).tolist()[:DAYLIGHT_DIM], 0.0, 0.0),
+        weather=tuple(0.0 if code in undrawn else weather[code] for code in Weather),
         foliage=tuple((environment.foliage - then.foliage).detach().clamp(-1, 1).tolist()),
         sun=tuple((environment.light - then.light).detach().clamp(-1, 1).tolist()),
     )

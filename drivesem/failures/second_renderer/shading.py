@@ -8,18 +8,16 @@ The photographed shadow moves with its vehicle; a contact shadow fills what the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from drivesem.failures.second_renderer.geometry import PictureCamera, VehiclePose, to_numpy
+from drivesem.failures.second_renderer.night import GAMMA
 from drivesem.failures.second_renderer.opengl import Array
 from scene_ir.types import Environment, Source, Weather
 
-_GAMMA = 2.2
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 _LIGHTNESS, _CHROMA, _GLOSS, _DIRT = 2.2, 45.0, 0.9 / 30, 0.55
@@ -39,19 +37,6 @@ _GLOW = np.array([0.35, 0.0, -0.35], np.float32)
 """What a low sun adds to the logarithm of light, at half the time code."""
 _SOFTENING = np.array([0.5, 0.4, 0.5, 0.6, 0.9, 0.6], np.float32)
 """Share of a cast shadow that vanishes at code 1 of fog, rain, time, overcast, night, snow."""
-
-_STREET, _HEADLAMPS = np.array([0.11, 0.085, 0.055], np.float32), np.array([0.6, 0.52, 0.4], np.float32)
-"""Light of street lamps, and of the own headlamps on what is near, relative to daylight."""
-_TOWN_GLOW = np.array([0.006, 0.0045, 0.0035], np.float32)
-"""Light of the sky by night."""
-_BEAM_M, _BEAM_RAD, _CUT_M = 15.0, 0.35, 0.9
-"""Distance at which the headlamps' light has fallen to half; half width of their beam; height of its upper edge."""
-_LAMPS_LIT = np.array([1.5, 1.2, 1.5, 0.3, 3.0, 1.2], np.float32)
-"""How much each code of weather makes drivers switch on their lamps."""
-_TAIL, _HEAD = np.array([2.0, 0.1, 0.05], np.float32), np.array([6.0, 5.5, 4.5], np.float32)
-"""Light of a vehicle's lamps by night; white is 1."""
-_LAMP_M, _LAMP_BY_DAY, _BRAKING = 0.09, 0.15, 2.5
-"""Radius of a lamp; its light by day, relative to that by night; light of a brake lamp, relative to a tail lamp's."""
 
 _AUTUMN, _SPRING, _MAX_TURN = 28.0, 150.0, 65.0
 """Hues in degrees towards which hue codes 1 and -1 turn the leaves; largest turn."""
@@ -95,7 +80,7 @@ def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: A
 
 def remaining_shade(weather: Array) -> float:
     """Share of a cast shadow's optical depth that remains under a weather code (5,)."""
-    return float(np.prod(1 - _SOFTENING * weather))
+    return float(np.prod(1 - _SOFTENING * weather[: len(_SOFTENING)]))
 
 
 def estimate_air_colour(photograph: Array, sky: Array) -> Array:
@@ -152,14 +137,17 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
     Returns:
         (H, W, 3) RGB in [0, 1].
     """
-    fog, rain, time, overcast, _, snow = environment.weather.tolist()
+    codes = environment.weather.tolist()
+    fog, rain, time, overcast, snow = (
+        codes[w] for w in (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST, Weather.SNOW)
+    )
     if not (fog or rain or time or overcast or snow):
         return image
     overcast = max(overcast, snow)  # it falls from a closed sky
     # Drops scatter all colours equally.
     mist = np.exp(-1.6 * (fog + rain + snow))
     sky, road = (open_to[..., None] * to_numpy(m)[..., None] for m in (environment.sky, environment.road))
-    light, air = image**_GAMMA, air**_GAMMA
+    light, air = image**GAMMA, air**GAMMA
     if overcast:
         grey = (light @ _LUMA)[..., None]
         # Sun and shade converge around the light of midday.
@@ -187,85 +175,7 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
         light += (1 - np.exp(-(_FOG_PER_M * fog + _SNOW_PER_M * snow) * depth)) * (air - light)
     if snow:
         light += snow * _snow_flakes(*light.shape[:2])[..., None] * (air - light)
-    return (light ** (1 / _GAMMA)).astype(np.float32)
-
-
-def apply_night(
-    image: Array,
-    depth_m: Array,
-    owner: NDArray[np.int64],
-    environment: Environment,
-    camera: PictureCamera,
-    poses: Sequence[VehiclePose],
-    codes: Array,
-) -> Array:
-    """Apply the environment's night, and switch on the vehicles' lamps as its weather makes drivers do.
-
-    Args:
-        image: (H, W, 3) RGB in [0, 1].
-        depth_m: (H, W), inf in the sky.
-        owner: (H, W), 0 for the background, i + 1 for vehicle i.
-        environment: Weather, sky and ground.
-        camera: Camera.
-        poses: Poses of the vehicles.
-        codes: (N,) codes of their lamps.
-
-    Returns:
-        (H, W, 3) RGB, at least 0.
-    """
-    weather = to_numpy(environment.weather)
-    if not (weather.any() or codes.any()):
-        return image
-    night = 1 - (1 - float(weather[Weather.NIGHT])) ** 4
-    light = np.clip(image, 0, None) ** _GAMMA
-    if night:
-        depth = np.minimum(depth_m, _LAYER_M)
-        columns, rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (camera.width, camera.height)))
-        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.intrinsics).T
-        ground = to_numpy(environment.ground)
-        height = depth * (rays @ ground[:3]) + ground[3] - camera.shift_m @ ground[:3]
-        beam = 1 / (1 + np.square(np.arctan(rays[..., 0]) / _BEAM_RAD) ** 2)
-        beam = (
-            beam * np.clip(1.2 - 0.5 * np.maximum(height - _CUT_M, 0), 0.1, 1) / (1 + np.square(depth / _BEAM_M))
-        )
-        lit = light / (1 + light) * (0.6 * _STREET + beam[..., None] * _HEADLAMPS)
-        sky = (to_numpy(environment.sky) * (owner == 0))[..., None]
-        light = light + night * (lit + sky * (_TOWN_GLOW - lit) - light)
-    driven = 1 - np.exp(-(float(_LAMPS_LIT @ weather) ** 2))
-    extinction = float(_FOG_PER_M * weather[Weather.FOG] + _RAIN_PER_M * weather[Weather.RAIN])
-    lamps = np.zeros_like(light)
-    for i, pose in enumerate(poses):
-        code = float(codes[i])
-        levels = driven * (1 + min(code, 0)) + np.array([0, _BRAKING * max(code, 0)])
-        _draw_lamps(lamps, owner == i + 1, pose, camera, extinction, levels)
-    glare = sum(cv2.GaussianBlur(lamps, (0, 0), width * camera.height) for width in (0.01, 0.04))
-    exposure = _LAMP_BY_DAY + (1 - _LAMP_BY_DAY) * night
-    return ((light + exposure * (lamps + 0.3 * glare)) ** (1 / _GAMMA)).astype(np.float32)
-
-
-def _draw_lamps(
-    lamps: Array,
-    seen: NDArray[np.bool_],
-    pose: VehiclePose,
-    camera: PictureCamera,
-    extinction: float,
-    levels: Array,
-) -> None:
-    """Add the light of a vehicle's visible lamps, discs at usual places of its box; levels: (2,) front and rear."""
-    for along, across in ((0.48, 0.38), (0.48, -0.38), (-0.48, 0.38), (-0.48, -0.38)):
-        local = np.array([along, -0.5, across], np.float32) * pose.size_lhw
-        place = pose.rotation() @ local + pose.translation + camera.shift_m
-        facing = float(pose.rotation()[:, 0] @ -place) * np.sign(along) / max(float(np.linalg.norm(place)), 1e-6)
-        if place[2] < 1 or facing <= 0:
-            continue
-        x, y = (round(float(v)) for v in camera.project(place.astype(np.float32)))
-        if not seen[max(y - 2, 0) : max(y + 3, 0), max(x - 2, 0) : max(x + 3, 0)].any():
-            continue
-        disc = np.zeros(seen.shape, np.uint8)
-        radius = max(_LAMP_M * float(camera.intrinsics[0, 0]) / float(place[2]), 0.7)
-        cv2.circle(disc, (x, y), round(radius), 1, -1)
-        colour = levels[0] * _HEAD * facing**4 if along > 0 else levels[1] * _TAIL * min(2 * facing, 1)
-        lamps[(disc > 0) & seen] += colour * np.exp(-extinction * place[2])
+    return (light ** (1 / GAMMA)).astype(np.float32)
 
 
 def _snow_flakes(height: int, width: int) -> Array:

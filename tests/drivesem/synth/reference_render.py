@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivesem.synth.light import LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS, develop
-from drivesem.synth.render import SHADOW_TEXELS, grain_number, rasterise, sun_rows, through_lens
+from drivesem.synth.render import SHADOW_TEXELS, grain_number, rasterise, sun_rows, through_lens, with_glare
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
 from drivesem.synth.view import (
     SHADOW_VIEWS_M,
@@ -30,8 +30,10 @@ def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) ->
     camera = setting.view.camera
     pixels = camera.height * camera.width
     image = np.empty((pixels, 3), np.float32)
-    develop_pixels(sight, setting, sun_maps(soup, setting), shadows, (image, np.ones(pixels, bool)))
-    return take(image.reshape(camera.height, -1, 3), setting)
+    shining = np.zeros_like(image)
+    develop_pixels(sight, setting, sun_maps(soup, setting), shadows, (image, np.ones(pixels, bool), shining))
+    shape = (camera.height, camera.width, 3)
+    return take(with_glare(image.reshape(shape), shining.reshape(shape), setting), setting)
 
 
 def see(soup: Soup, view: View) -> Sight:
@@ -103,12 +105,12 @@ def develop_pixels(
     setting: Setting,
     maps: SunMaps | None,
     shadows: list[Shadow],
-    target: tuple[np.ndarray, np.ndarray],
+    target: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Fill in display values. target: the image (H * W, 3) to fill and the pixels (H * W,) to do. Returns the
-    pixels (H * W,) that actors touch.
+    """Fill in display values. target: the image (H * W, 3) to fill, the pixels (H * W,) to do, and the light beyond
+    white (H * W, 3) to fill where lamps are on. Returns the pixels (H * W,) that actors touch.
     """
-    image, wanted = target
+    image, wanted, shining = target
     n, width = SUPERSAMPLING, setting.view.camera.width
     once, apart = _shading_sites(sight)
     whole, parts = np.flatnonzero(once & wanted), np.flatnonzero(apart & wanted)
@@ -125,6 +127,10 @@ def develop_pixels(
     image[whole] = visible[: len(whole)]
     fine_visible = visible[len(whole) :].reshape(-1, n * n, 3)
     image[parts] = sum(fine_visible[:, i] for i in range(n * n)) / np.float32(n * n)
+    if len(setting.lamps):
+        beyond = np.maximum(radiance * setting.response.exposure * setting.response.white_balance - 1, 0)
+        shining[whole] = beyond[: len(whole)]
+        shining[parts] = beyond[len(whole) :].reshape(-1, n * n, 3).mean(axis=1)
     touched = np.zeros(len(image), bool)
     touched[whole] = changed[: len(whole)]
     touched[parts] = changed[len(whole) :].reshape(-1, n * n).any(axis=1)
@@ -202,7 +208,7 @@ def _shade_sites(
         open_sky=open_sky,
         pixel_m=point[:, 2] / np.float32(view.camera.intrinsics[0, 0]),
     )
-    out[land] = shade(samples, setting.road, setting.light, setting.noise, view.height_m)
+    out[land] = shade(samples, setting)
     return out, changed
 
 

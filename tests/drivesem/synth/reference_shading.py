@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivesem.synth import lamps as lamping
 from drivesem.synth.layout import Road
 from drivesem.synth.light import MIRRORED_GROUND, SOAKED, Light, ground_light
 from drivesem.synth.soup import GROUND, Material
-from drivesem.synth.view import NoiseSet
+from drivesem.synth.view import NoiseSet, Setting
 from tests.drivesem.synth.reference_light import reflected_radiance, sample
 
 _F = np.float32
@@ -130,8 +131,59 @@ def _paint_grass(s: Samples, noise: NoiseSet, along_px: np.ndarray) -> np.ndarra
     return albedo * np.maximum(tone, 0.25)[:, None]
 
 
+def _lamp_light(s: Samples, light: Light, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance (n, 3) at right angles from a lamp, and unit directions (n, 3) to it."""
+    to = row[:3] - s.point
+    square = np.einsum("ni,ni->n", to, to)
+    to = to / np.sqrt(square + 1e-9)[:, None]
+    ahead, kind = -to @ row[3:6], row[9]
+    if kind == lamping.BEAM:
+        share = lamping.beam_share(-to, row[3:6], light.up.astype(_F))
+    else:
+        share = np.clip(ahead * (4 if kind == lamping.STREET else 1), 0, 1)
+    share = np.where((s.owner > 0) & (s.owner == row[10]), 0, share)
+    return row[6:9] * (share / (square + lamping.LAMP_SIZE_M**2))[:, None], to
+
+
+def _lamplight(s: Samples, light: Light, lamps: np.ndarray) -> np.ndarray:
+    """What matt surfaces (n, 3) get from all lamps."""
+    back = -unit(s.point)
+    seen = np.clip(np.einsum("ni,ni->n", s.normal, back), 0, 1)
+    ground = np.isin(s.material, GROUND)
+    coated = (s.material >= Material.METAL) & (s.material <= Material.TRIM)
+    retro = coated & (s.pattern[:, 0] + s.pattern[:, 3] > 0)
+    total = np.zeros_like(s.point)
+    for row in lamps:
+        irradiance, to = _lamp_light(s, light, row)
+        slope = np.clip(np.einsum("ni,ni->n", s.normal, to), 0, 1)
+        rough = s.open_sky * (1 - lamping.ROUGH + lamping.ROUGH / np.maximum(slope + seen, 1e-3))
+        off = (1 - np.einsum("ni,ni->n", to, back)) * 2 / lamping.RETRO_RAD**2
+        gain = slope * np.where(ground, rough, 1) * np.where(retro, 1 + lamping.RETRO / (1 + off), 1)
+        total += irradiance * gain[:, None]
+    return total
+
+
+def _glints(
+    s: Samples, light: Light, lamps: np.ndarray, rough: np.ndarray | float, reflectance: float
+) -> np.ndarray:
+    """Radiance (n, 3) of all lamps in a coat with microfacets (Trowbridge and Reitz)."""
+    back = -unit(s.point)
+    seen = np.maximum(np.einsum("ni,ni->n", s.normal, back), 1e-3)
+    total = np.zeros_like(s.point)
+    for row in lamps:
+        irradiance, to = _lamp_light(s, light, row)
+        slope = np.clip(np.einsum("ni,ni->n", s.normal, to), 0, 1)
+        half = unit(to + back)
+        cosine = np.clip(np.einsum("ni,ni->n", s.normal, half), 0, 1)
+        fresnel = reflectance + (1 - reflectance) * (1 - np.clip(np.einsum("ni,ni->n", half, back), 0, 1)) ** 5
+        slopes = np.square(rough) / (np.square(cosine) * (np.square(rough) - 1) + 1) ** 2
+        masked = 2 * slope * seen * (1 - rough) + (slope + seen) * rough
+        total += irradiance * (slopes * 0.5 / masked * fresnel * slope)[:, None]
+    return np.minimum(total, lamping.BRIGHTEST_GLINT)
+
+
 def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo and added radiance (mirrored sky in the panes) of walls with windows."""
+    """Albedo and added radiance (mirrored sky in the panes, rooms behind) of walls with windows."""
     pitch, storey, wide, tall = s.pattern.T
     u, v = s.uv[:, 0], s.uv[:, 1]
     blur = np.maximum(s.pixel_m, 0.01)
@@ -155,6 +207,10 @@ def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.n
     sill = np.mod(row / storey, 1.0) - 0.5
     inside = inside * np.clip(1.0 - 1.4 * sill / np.maximum(tall, 0.1), 0.3, 1.0)
     albedo += (inside[:, None] * _rgb(1.0, 0.97, 0.92) - albedo) * pane[:, None]
+    warm, cool = _rgb(*lamping.WINDOW_RGB), _rgb(*lamping.WINDOW_COOL)
+    room = warm + (cool - warm) * (0.5 + 0.5 * np.sin(40 * cell))[:, None]
+    lit = np.clip((cell - lamping.WINDOW_FROM) * lamping.WINDOW_SLOPE, 0, 1) * np.clip(1 + sill, 0.5, 1.5)
+    room = room * (lit * pane * light.night)[:, None]
     view = unit(s.point)
     cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
     mirror = view + 2 * cosine[:, None] * s.normal
@@ -164,10 +220,10 @@ def _facade(s: Samples, light: Light, noise: NoiseSet) -> tuple[np.ndarray, np.n
         reflected_radiance(light, tilt.astype(_F), noise, np.full(3, MIRRORED_GROUND))
         * (fresnel * pane * 0.8)[:, None]
     )
-    return albedo, glare
+    return albedo, glare + room
 
 
-def _irradiance(s: Samples, light: Light, bounce: np.ndarray) -> np.ndarray:
+def _irradiance(s: Samples, light: Light, bounce: np.ndarray, lamps: np.ndarray) -> np.ndarray:
     """Light (n, 3) arriving on matt surfaces."""
     facing = s.normal @ light.up.astype(_F)
     slope = np.clip(s.normal @ light.sun.astype(_F), 0, 1) * s.lit
@@ -177,13 +233,21 @@ def _irradiance(s: Samples, light: Light, bounce: np.ndarray) -> np.ndarray:
         slope[:, None] * light.sun_colour.astype(_F)
         + sky[:, None] * light.ambient.astype(_F)
         + ground[:, None] * bounce.astype(_F)
+        + _lamplight(s, light, lamps)
     )
 
 
 def _polish(
-    s: Samples, light: Light, noise: NoiseSet, base: np.ndarray, gloss: tuple[float, float, float]
+    s: Samples,
+    light: Light,
+    noise: NoiseSet,
+    base: np.ndarray,
+    gloss: tuple[float, float, float],
+    lamps: np.ndarray,
 ) -> np.ndarray:
-    """Radiance mirrored by a smooth coat: gloss is (reflectance at right angles, weight, sharpness of the sun)."""
+    """Radiance mirrored by a smooth coat, and of what shines: gloss is (reflectance at right angles, weight,
+    sharpness of the sun).
+    """
     view = unit(s.point)
     cosine = np.clip(-np.einsum("ni,ni->n", view, s.normal), 0, 1)
     mirror = (view + 2 * cosine[:, None] * s.normal).astype(_F)
@@ -194,21 +258,23 @@ def _polish(
     glint = np.clip(mirror @ light.sun.astype(_F), 0, 1)
     sharp = (glint ** _F(gloss[2])) * 14.0 + (glint**12) * 0.25
     out += (sharp * fresnel * s.lit)[:, None] * light.sun_colour.astype(_F)
-    return base + out
+    out += _glints(s, light, lamps, lamping.COAT_ROUGH, gloss[0]) * gloss[1]
+    return base + out + s.albedo * s.pattern[:, 1:2]
 
 
-def shade(s: Samples, road: Road, light: Light, noise: NoiseSet, camera_height_m: float) -> np.ndarray:
+def shade(s: Samples, setting: Setting) -> np.ndarray:
     """Linear radiance (n, 3) of the samples as seen by the camera, haze included."""
+    road, light, noise, lamps = setting.road, setting.light, setting.noise, setting.lamps
     out = np.zeros((len(s.material), 3), _F)
-    bounce = ground_light(light)
+    extra = (ground_light(light), setting.view.height_m, lamps)
     order = np.argsort(s.material, kind="stable")
     bounds = np.searchsorted(s.material[order], np.arange(len(Material) + 1))
     for material in Material:
         index = order[bounds[material] : bounds[material + 1]]
         if len(index):
             some = s.take(index)
-            colour = _surface(some, material, road, light, noise, (bounce, camera_height_m))
-            out[index] = _wetted(some, material, colour, light, noise) if light.wet > 0 else colour
+            colour = _surface(some, material, road, light, noise, extra)
+            out[index] = _wetted(some, material, colour, light, noise, lamps) if light.wet > 0 else colour
     distance = np.sqrt(np.einsum("ni,ni->n", s.point, s.point))
     through = np.exp(-light.haze_per_m * distance)[:, None].astype(_F)
     air = light.horizon * 0.6
@@ -216,10 +282,15 @@ def shade(s: Samples, road: Road, light: Light, noise: NoiseSet, camera_height_m
 
 
 def _surface(
-    s: Samples, material: Material, road: Road, light: Light, noise: NoiseSet, extra: tuple[np.ndarray, float]
+    s: Samples,
+    material: Material,
+    road: Road,
+    light: Light,
+    noise: NoiseSet,
+    extra: tuple[np.ndarray, float, np.ndarray],
 ) -> np.ndarray:
-    bounce, camera_height_m = extra
-    incoming = _irradiance(s, light, bounce)
+    bounce, camera_height_m, lamps = extra
+    incoming = _irradiance(s, light, bounce, lamps)
     along_px = s.pixel_m * np.maximum(s.point[:, 2] / camera_height_m, 1.0) if material in GROUND else s.pixel_m
     u, v = s.uv[:, 0], s.uv[:, 1]
     if material == Material.ROAD:
@@ -260,22 +331,24 @@ def _surface(
         tone = 1 + 0.3 * _noise(noise.rough, (p[:, 0] + p[:, 2]) * 3, p[:, 1], 0.04)
         return s.albedo * np.maximum(tone, 0.3)[:, None] * incoming
     if material == Material.PAINT:
-        return _polish(s, light, noise, _dirty(s, noise) * incoming, (0.05 + 0.02 * light.wet, 1.0, 600.0))
+        return _polish(s, light, noise, _dirty(s, noise) * incoming, (0.05 + 0.02 * light.wet, 1.0, 600.0), lamps)
     if material == Material.GLASS:
-        return _polish(s, light, noise, s.albedo * incoming, (0.07, 1.0, 900.0))
+        return _polish(s, light, noise, s.albedo * incoming, (0.07, 1.0, 900.0), lamps)
     if material == Material.LIGHT:
-        return _polish(s, light, noise, s.albedo * 0.8 * incoming, (0.08, 0.9, 500.0))
+        return _polish(s, light, noise, s.albedo * 0.8 * incoming, (0.08, 0.9, 500.0), lamps)
     if material == Material.METAL:
-        return _polish(s, light, noise, s.albedo * incoming, (0.10, 0.5, 40.0))
+        return _polish(s, light, noise, s.albedo * incoming, (0.10, 0.5, 40.0), lamps)
     if material in (Material.TYRE, Material.TRIM):
-        return _polish(s, light, noise, s.albedo * 0.9 * incoming, (0.03, 0.5, 60.0))
+        return _polish(s, light, noise, s.albedo * 0.9 * incoming, (0.03, 0.5, 60.0), lamps)
     if material == Material.FLAT:
         tone = 1 + 0.08 * _noise(noise.soft, s.world[:, 0] + s.world[:, 2], s.world[:, 1], 0.03)
-        return _polish(s, light, noise, s.albedo * tone[:, None] * incoming, (0.03, 0.4, 60.0))
+        return _polish(s, light, noise, s.albedo * tone[:, None] * incoming, (0.03, 0.4, 60.0), lamps)
     return s.albedo * incoming
 
 
-def _wetted(s: Samples, material: Material, dry: np.ndarray, light: Light, noise: NoiseSet) -> np.ndarray:
+def _wetted(
+    s: Samples, material: Material, dry: np.ndarray, light: Light, noise: NoiseSet, lamps: np.ndarray
+) -> np.ndarray:
     """Radiance (n, 3) after rain of what is `dry` before: darker, mirroring sky and skyline where water lies."""
     loss, film, more = SOAKED[material]
     out = dry * (1 - loss * _F(light.wet))
@@ -290,7 +363,10 @@ def _wetted(s: Samples, material: Material, dry: np.ndarray, light: Light, noise
     share = (0.02 + 0.98 * (1 - cosine) ** 5) * cover
     mirror = (view + 2 * cosine[:, None] * s.normal).astype(_F)
     env = reflected_radiance(light, mirror, noise, np.full(3, MIRRORED_GROUND), soft=True)
-    return out * (1 - share)[:, None] + env * (share * (0.25 + 0.75 * s.open_sky))[:, None]
+    hidden = 0.25 + 0.75 * s.open_sky
+    rough = lamping.WET_ROUGH + (lamping.PUDDLE_ROUGH - lamping.WET_ROUGH) * puddle
+    glints = _glints(s, light, lamps, rough, 0.02) * (cover * hidden)[:, None]
+    return out * (1 - share)[:, None] + env * (share * hidden)[:, None] + glints
 
 
 def _dirty(s: Samples, noise: NoiseSet) -> np.ndarray:

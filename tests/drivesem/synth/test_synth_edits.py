@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from drivesem.synth.edits import ALL, FrameEdit, ObjectEdit, apply_edit, apply_edits, read_edits
-from drivesem.synth.frames import SynthSettings, plan_frame, render_frame
+from drivesem.synth import edits
+from drivesem.synth.edits import ALL, FrameEdit, ObjectEdit, apply_edit, apply_edits, draw_night, read_edits
+from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, plan_frame, render_frame
+from drivesem.synth.lamps import beam_share
 from drivesem.synth.layout import LayoutSettings, clearance, footprint
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
+from scene_ir.geometry import yaw_matrix
+from scene_ir.meshes.templates import template
 from scene_ir.render.environment import apply_weather, sky_colour
+from scene_ir.render.lamps import find_lamp_places
+from scene_ir.types import Weather
 
 SETTINGS = SynthSettings(LayoutSettings(people=False, vehicles=(6, 8)), sunny=True)
 
@@ -151,6 +158,133 @@ def test_sunset_and_twilight_are_the_compositors(plan, time):
     composed = apply_weather(picture, inverse, environment, sky_colour(picture, environment.sky.double()))
     expected = drawn.image.reshape(-1, 3).mean(axis=0) / 255
     assert composed.flatten(1).mean(dim=1).numpy() == pytest.approx(expected, rel=0.2)
+
+
+def weather(**codes: float) -> tuple[float, ...]:
+    return tuple(codes.get(code.name.lower(), 0.0) for code in Weather)
+
+
+def render_edit(plan: Plan, **edit: Any) -> SynthFrame:
+    frame = render_frame(apply_edit(plan, FrameEdit(**edit)))
+    assert frame is not None
+    return frame
+
+
+NIGHT = weather(night=1.0)
+
+
+def test_night_leaves_the_labels_and_gives_the_same_bytes_again(plan):
+    day, night, again = render_edit(plan), *(render_edit(plan, weather=NIGHT) for _ in range(2))
+    assert torch.equal(day.labels.boxes_xyxy, night.labels.boxes_xyxy)
+    assert np.array_equal(day.depth_m, night.depth_m)
+    assert np.array_equal(day.instance, night.instance)
+    assert np.array_equal(day.semantic, night.semantic)
+    assert night.image.tobytes() == again.image.tobytes()
+
+
+def test_daylight_falls_with_the_code_of_night(plan):
+    frames = [render_edit(plan, weather=weather(night=code)) for code in (0.0, 0.01, 0.25, 0.5, 0.75, 1.0)]
+    sky = frames[0].environment.sky.numpy() > 0.9
+    levels = [float(frame.image[sky].mean()) for frame in frames]
+    assert levels == sorted(levels, reverse=True)
+    assert levels[0] - levels[1] < 4
+    assert frames[-1].image.mean() < 0.5 * frames[0].image.mean()
+
+
+def test_lamps_by_day_change_nothing_unless_they_brake(plan):
+    day, off, brake = (render_edit(plan, objects={ALL: ObjectEdit(lamps=code)}) for code in (0.0, -1.0, 1.0))
+    assert day.image.tobytes() == off.image.tobytes()
+    redder = brake.image[..., 0].astype(int) - day.image[..., 0]
+    assert redder.max() > 40
+    assert (redder[day.instance == 0] > 40).mean() < 1e-3
+
+
+def lamps_in_picture(frame: SynthFrame, mirrored: bool) -> list[tuple[int, int]]:
+    """Pixels (x, y) of the template's lamps that face the camera, or of their mirror images below the road."""
+    view, found = frame.setting.view, []
+    for truth in frame.truths:
+        places = find_lamp_places(template(truth.actor.kind, truth.actor.variant)).numpy() * truth.actor.size_lhw
+        turn = yaw_matrix(torch.tensor(truth.yaw, dtype=torch.float64)).numpy()
+        points = places @ turn.T + truth.translation
+        axes = np.array([turn[:, 0] * sign for sign in (1, 1, -1, -1)])
+        points = points[(points * axes).sum(axis=1) < 0]
+        if mirrored:
+            points = points - 2 * (points @ view.up + view.height_m)[:, None] * view.up
+        clip = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ view.camera.matrix.double().numpy().T
+        found += [(int(x), int(y)) for x, y in np.rint(clip[:, :2] / clip[:, 2:])]
+    return found
+
+
+@pytest.fixture(scope="module")
+def two_cars(plan):
+    """One car ahead, seen from behind, and one that comes towards the camera."""
+    car = replace(plan.actors[0], parked=False, lane_ds=None)
+    away = replace(car, position_xz=(1.0, 12.0), yaw=-math.pi / 2)
+    coming = replace(car, position_xz=(-3.5, 15.0), yaw=math.pi / 2, track=1)
+    return replace(plan, actors=(away, coming))
+
+
+def test_lamps_shine_where_vehicles_have_them(two_cars):
+    lit, off = (render_edit(two_cars, weather=NIGHT, objects={ALL: ObjectEdit(lamps=c)}) for c in (0.0, -1.0))
+    change = lit.image.astype(int) - off.image
+    places = lamps_in_picture(lit, mirrored=False)
+    assert len(places) == 4
+    for x, y in places:
+        assert change[y - 2 : y + 3, x - 2 : x + 3, 0].max() > 60
+    rear, front = (
+        [change[y - 2 : y + 3, x - 2 : x + 3].max(axis=(0, 1)) for x, y in p] for p in (places[:2], places[2:])
+    )
+    assert min(colour[0] - colour[2] for colour in rear) > 30
+    assert min(colour[2] for colour in front) > 60
+
+
+def test_a_wet_road_mirrors_tail_lamps(two_cars):
+    red = {}
+    for rain in (0.0, 1.0):
+        codes = weather(night=1.0, rain=rain)
+        on, off = (render_edit(two_cars, weather=codes, objects={0: ObjectEdit(lamps=c)}) for c in (1.0, -1.0))
+        change = on.image.astype(int) - off.image
+        places = lamps_in_picture(on, mirrored=True)[:2]
+        red[rain] = [(change[y - 3 : y + 4, x - 3 : x + 4] @ [1, 0, -1]).max() for x, y in places]
+    assert min(red[1.0]) > 25
+    assert min(red[1.0]) > 2 * max(red[0.0])
+
+
+def test_a_parked_car_is_dark_by_night(plan):
+    parked = replace(plan, actors=tuple(replace(a, parked=True) for a in plan.actors))
+    auto, off = (
+        render_edit(parked, weather=NIGHT, objects={ALL: ObjectEdit(lamps=code)}).image for code in (0.0, -1.0)
+    )
+    assert auto.tobytes() == off.tobytes()
+
+
+def test_headlamps_light_what_is_near_and_below_their_cut_off():
+    axis, up = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
+    degrees = np.deg2rad([-6.0, -2.0, 2.0, 10.0])
+    rise = beam_share(np.stack([0 * degrees, -np.sin(degrees), np.cos(degrees)], axis=1), axis, up)
+    assert rise[1] > rise[0] > 10 * rise[2]
+    assert rise[2] == pytest.approx(rise[3], rel=0.05)
+    turn = np.deg2rad([0.0, 15.0, 40.0, 89.0, 120.0])
+    down = np.sin(0.04)
+    aside = beam_share(np.stack([np.sin(turn), np.full(5, down), np.cos(turn)], axis=1), axis, up)
+    assert (np.diff(aside[:4]) < 0).all()
+    assert aside[4] == 0
+
+
+def test_weather_that_the_generator_does_not_draw_is_one_line(plan, monkeypatch):
+    monkeypatch.setattr(edits, "DRAWN_WEATHER", (Weather.FOG,))
+    with pytest.raises(RangeError, match=r"weather.night: expected 0, since generated streets .* found 1.0"):
+        apply_edit(plan, FrameEdit(weather=NIGHT))
+
+
+def test_nights_are_drawn_for_a_share_of_streets():
+    plans = [draw_night(plan_frame(3, i, settings=SETTINGS), 0.5) for i in range(40)]
+    nights = [plan for plan in plans if plan.setting.light.night > 0]
+    assert 10 < len(nights) < 30
+    assert 0 < sum(plan.setting.light.wet > 0 for plan in nights) < len(nights)
+    assert {a.lamps < 0 for plan in nights for a in plan.actors} == {True, False}
+    plain = plan_frame(3, 0, settings=SETTINGS)
+    assert draw_night(plain, 0.0) is plain
 
 
 def test_bare_trees_have_fewer_leaves_and_dense_ones_no_fewer(plan):

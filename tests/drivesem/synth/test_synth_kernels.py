@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.synth import kernels
+from drivesem.synth import kernels, lamps
 from drivesem.synth import render as rendering
 from drivesem.synth.frames import SynthSettings, actor_soups, plan_frame
 from drivesem.synth.layout import Marking, Road
@@ -96,8 +96,8 @@ def shaded(setting: Setting, develop_pixels):
     world = a_world(setting.view)
     sight, maps = see(world, setting.view), reference.sun_maps(world, setting)
     pixels = setting.view.camera.height * setting.view.camera.width
-    image = np.zeros((pixels, 3), np.float32)
-    return image, develop_pixels(sight, setting, maps, SHADOWS, (image, np.ones(pixels, bool)))
+    image, shining = np.zeros((2, pixels, 3), np.float32)
+    return image, develop_pixels(sight, setting, maps, SHADOWS, (image, np.ones(pixels, bool), shining)), shining
 
 
 RAMP = np.stack(np.meshgrid(np.linspace(0, 1, 64), np.linspace(1, 0, 32)), axis=-1)
@@ -118,13 +118,50 @@ def test_materials_agree_with_numpy(weather, heading):
     view = a_view(heading, (1.5, -2.0), (160, 480))
     light = a_light(view, heading=heading, **WEATHERS[weather])
     setting = a_setting(view, replace(light, sun=light.sun / np.linalg.norm(light.sun)))
-    fast, touched = shaded(setting, kernels.develop_pixels)
-    slow, expected = shaded(setting, reference.develop_pixels)
+    fast, touched, shining = shaded(setting, kernels.develop_pixels)
+    slow, expected, expected_shining = shaded(setting, reference.develop_pixels)
+    assert not shining.any()
+    assert not expected_shining.any()
     difference = np.abs(fast - slow).max(axis=1)
     assert (difference > 2e-3).mean() < 5e-4
     assert np.quantile(difference, 0.99) < 5e-4
     assert (touched != expected).mean() < 2e-4
     assert slow.std() > 0.05
+
+
+NIGHT = {
+    "sun_colour": np.zeros(3), "zenith": np.full(3, 0.001), "horizon": np.full(3, 0.004), "ambient": np.full(3, 0.008),
+    "night": 1.0,
+}  # fmt: skip
+
+
+def some_lamps(view: View) -> np.ndarray:
+    """A street lamp, headlamps from behind the camera and towards it, a tail lamp of actor 1."""
+    ahead = view.rotation @ np.array([np.sin(view.heading), 0.0, np.cos(view.heading)])
+    places = (
+        view.to_camera(np.array([[2, -7, 14], [0.6, -0.7, 1], [-3, -0.7, 40], [-2, -0.8, 8]], float)) - view.centre
+    )
+    axes = np.stack([-view.up, ahead, -ahead, -ahead])
+    colours = np.array([[26, 18, 10], [120, 100, 80], [90, 95, 100], [2, 0.1, 0.05]])
+    kinds = np.array([[lamps.STREET, 0], [lamps.BEAM, 0], [lamps.BEAM, 0], [lamps.TAIL, 1]])
+    return np.concatenate([places, axes, colours, kinds], axis=1).astype(np.float32)
+
+
+@pytest.mark.parametrize("changes", [{}, {"wet": 0.9}, {"haze_per_m": 0.02}], ids=["dry", "wet", "foggy"])
+def test_lamps_by_night_agree_with_numpy(changes):
+    view = a_view(-0.3, (1.5, -2.0), (160, 480))
+    light = a_light(view, heading=-0.3, **NIGHT, **changes)
+    setting = replace(a_setting(view, light), lamps=some_lamps(view))
+    fast, _, shining = shaded(setting, kernels.develop_pixels)
+    slow, _, expected = shaded(setting, reference.develop_pixels)
+    difference = np.abs(fast - slow).max(axis=1)
+    assert (difference > 2e-3).mean() < 1e-3
+    assert np.quantile(difference, 0.99) < 5e-4
+    assert slow.std() > 0.05
+    assert shining.sum() == pytest.approx(expected.sum(), rel=1e-3)
+    unlit, _, _ = shaded(replace(setting, lamps=setting.lamps[:0]), kernels.develop_pixels)
+    assert (fast >= unlit - 1e-6).all()
+    assert fast.mean() > 2 * unlit.mean()
 
 
 def test_the_scene_shows_every_material():

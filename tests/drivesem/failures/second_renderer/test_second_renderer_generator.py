@@ -34,7 +34,7 @@ from drivesem.synth.write import Order, synthesise
 from scene_ir import ffd, files
 from scene_ir.errors import FormatError
 from scene_ir.geometry import project, yaw_matrix
-from scene_ir.types import LATTICE, SceneIR
+from scene_ir.types import LATTICE, SceneIR, Weather
 
 AHEAD_M = 0.5
 
@@ -268,11 +268,24 @@ def test_what_has_no_counterpart_is_named_where_it_was_changed(plan: Plan, stree
     found = transfer_edit(street_scene, changed, match_tracks(plan, None, tracks_of(plan)[1], None))
     assert found.missing == ("objects[0]: the generator's plan has no such vehicle",)
     assert list(found.edit.objects) == [tracks_of(plan)[1]]
-    by_night = street_scene.with_environment(weather=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5, 0.5]))
-    assert transfer_edit(street_scene, by_night, match_tracks(plan, *tracks_of(plan))).missing == (
-        "night: generated streets are drawn by daylight",
-        "snow: no snow falls in generated streets",
+    in_snow = street_scene.with_environment(weather=torch.eye(len(Weather))[Weather.SNOW])
+    assert transfer_edit(street_scene, in_snow, match_tracks(plan, *tracks_of(plan))).missing == (
+        "snow: generated streets are drawn without it",
     )
+
+
+def test_night_and_lamps_are_transferred(plan: Plan, street_scene: SceneIR) -> None:
+    codes = torch.zeros(len(Weather))
+    codes[Weather.NIGHT] = 0.5
+    lamps = street_scene.objects.lamps.clone()
+    lamps[1] = -0.75
+    changed = street_scene.with_objects(lamps=lamps).with_environment(weather=codes)
+    found = transfer_edit(street_scene, changed, match_tracks(plan, *tracks_of(plan)))
+    assert found.missing == ()
+    assert found.edit.weather == tuple(codes.tolist())
+    assert [found.edit.objects[track].lamps for track in tracks_of(plan)] == [0.0, -0.75, 0.0]
+    unknown = transfer_edit(street_scene, changed, match_tracks(plan, tracks_of(plan)[0], None, None))
+    assert unknown.missing == ("objects[1]: the generator's plan has no such vehicle",)
 
 
 BOX = (100.0, 100.0, 160.0, 140.0)
