@@ -30,7 +30,7 @@ from drivesem.synth.light import Light
 from scene_ir.errors import RangeError
 from scene_ir.ffd import from_symmetric
 from scene_ir.render.environment import low_sun_share, move_sun, time_gain
-from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, SUN_STRENGTH
+from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, SUN_STRENGTH, TWILIGHT_SKY
 from scene_ir.render.texture import apply_texture_code
 from scene_ir.types import Weather
 
@@ -40,6 +40,8 @@ _GAMMA = 2.2
 """Display values to linear light."""
 DRAWN_WEATHER = (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST, Weather.NIGHT)
 """Codes of weather that the generator draws."""
+_CLOSED_SKY = 1.15
+"""Light of a closed sky, relative to the mean light at the horizon of a clear one."""
 _WET_NIGHTS, _BRAKING, _UNLIT = 0.3, 0.25, 0.03
 """Shares of nights in rain, and of drivers who brake or have no lamps on."""
 
@@ -160,18 +162,20 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
     low_sun = low_sun_share(*(torch.tensor(value, dtype=torch.float64) for value in (fog, rain, overcast)))
-    daylight = (1 + time_gain(torch.tensor(time, dtype=torch.float64), low_sun).numpy()) ** _GAMMA
+    gain = time_gain(torch.tensor(time, dtype=torch.float64), low_sun).numpy()
+    daylight = (1 + gain) ** _GAMMA
+    skylight = (1 + gain + np.array(TWILIGHT_SKY) * time * time) ** _GAMMA
 
-    def toward(value: np.ndarray, target: np.ndarray | float) -> np.ndarray:
-        return (value + cover * (target - value)) * daylight
+    def toward(value: np.ndarray, target: np.ndarray | float, share: np.ndarray = skylight) -> np.ndarray:
+        return (value + cover * (target - value)) * share
 
     sun_lost = light.sun_colour * max(float(light.sun @ light.up), 0.0)
     light = replace(
         light,
         sun_colour=light.sun_colour * (1 - cover) * daylight,
-        zenith=toward(light.zenith, 0.8 * grey),
-        horizon=toward(light.horizon, grey),
-        ambient=toward(light.ambient, float(np.mean(light.ambient + 0.45 * sun_lost))),
+        zenith=toward(light.zenith, _CLOSED_SKY * grey),
+        horizon=toward(light.horizon, _CLOSED_SKY * grey),
+        ambient=toward(light.ambient, float(np.mean(light.ambient + 0.45 * sun_lost)), daylight),
         clouds=max(light.clouds, cover),
         haze_per_m=light.haze_per_m + FOG_EXTINCTION_PER_M * fog + RAIN_EXTINCTION_PER_M * rain,
         wet=max(light.wet, rain),

@@ -82,8 +82,7 @@ def compute_night_maps(scene: SceneIR, background: Tensor) -> NightMaps:
     fixed = torch.from_numpy(np.stack([*planes])).to(like)
     glare = glare + lamps + ((1 - sky) * missed * glow)[..., None] * np.array(model.GLOW_RGB)
     glare, shining = (
-        torch.from_numpy(np.ascontiguousarray(np.moveaxis(light, 2, 0))).to(like)
-        for light in (glare, shining)
+        torch.from_numpy(np.ascontiguousarray(np.moveaxis(light, 2, 0))).to(like) for light in (glare, shining)
     )
     mirrored = mirror_in_ground(shining, 1.0 / scene.depth, scene.environment.road, rise, camera_m)
     wet = model.LIT_MIRROR * mirror_share(scene.depth, camera_m).to(like) * mirrored

@@ -45,7 +45,7 @@ _TAIL, _HEAD = np.array([2.0, 0.1, 0.05], np.float32), np.array([6.0, 5.5, 4.5],
 """Light of a vehicle's lamps by night; white is 1."""
 _LAMP_M, _LAMP_BY_DAY, _BRAKING = 0.06, 0.15, 2.5
 """Width of a lamp; its light by day, relative to that by night; light of a brake lamp, relative to a tail lamp's."""
-_FOG_PER_M, _RAIN_PER_M = 0.03, 0.006
+_FOG_PER_M, _RAIN_PER_M = 0.03, 0.002
 _WINDOW = 0.93
 """Display value from which a small area above the ground counts as a lamp or a lit window."""
 _GLARE = ((0.004, 0.5), (0.012, 0.25), (0.05, 0.12))

@@ -27,12 +27,14 @@ _DUST = np.array([0.47, 0.42, 0.35], np.float32)
 _DUSTLESS = 0.75
 """Share of the dust that is missing at the roof."""
 
-_FOG_PER_M, _RAIN_PER_M, _SNOW_PER_M = 0.03, 0.006, 0.0075
+_FOG_PER_M, _RAIN_PER_M, _SNOW_PER_M = 0.03, 0.002, 0.0025
 _LAYER_M = 300.0
 """Thickness of the air in front of the sky."""
 _GREY_AIR = (0.78, 0.82, 0.87)
-_DUSK = np.array([2.0, 1.75, 1.25], np.float32)
-"""Optical depth of red, green and blue light at time code 1."""
+_DUSK, _DUSK_SKY = np.array([0.85, 0.75, 0.55], np.float32), np.array([0.9, 0.7, 0.4], np.float32)
+"""Optical depth of red, green and blue light at time code 1, as the camera exposes it, and what the sky glows above
+that.
+"""
 _GLOW = np.array([0.35, 0.0, -0.35], np.float32)
 """What a low sun adds to the logarithm of light, at half the time code."""
 _SOFTENING = np.array([0.5, 0.4, 0.5, 0.6, 0.9, 0.6], np.float32)
@@ -80,7 +82,7 @@ def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: A
 
 def remaining_shade(weather: Array) -> float:
     """Share of a cast shadow's optical depth that remains under a weather code (5,)."""
-    return float(np.prod(1 - _SOFTENING * weather[: len(_SOFTENING)]))
+    return float(np.prod(1 - _SOFTENING * weather))
 
 
 def estimate_air_colour(photograph: Array, sky: Array) -> Array:
@@ -152,13 +154,13 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
         grey = (light @ _LUMA)[..., None]
         # Sun and shade converge around the light of midday.
         plain = 0.16 * (np.maximum(0.5 * light + 0.5 * grey, 1e-4) / 0.16) ** 0.75
-        cover = float(air @ _LUMA) * 0.6 + 0.1 + 0.1 * (grey - grey.mean())
+        cover = float(air @ _LUMA) * 0.6 + 0.4 + 0.1 * (grey - grey.mean())
         plain += sky * (cover - plain)
         light += 0.9 * overcast * (plain - light)
-        air = air + 0.9 * overcast * (0.8 * float(air @ _LUMA) - air)
+        air = air + 0.9 * overcast * (1.1 * float(air @ _LUMA) - air)
     if time:
         gain = np.exp(-_DUSK * time**2 + mist * (1 - overcast) * _GLOW * np.sin(np.pi * time))
-        light, air = light * gain, air * gain
+        light, air = light * gain * (1 + sky * _DUSK_SKY * time**2), air * gain
     depth = np.minimum(depth_m, _LAYER_M)[..., None]
     if rain:
         grey = (light @ _LUMA)[..., None]
@@ -169,8 +171,8 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
     light = np.clip(light, 0, 1)
     air = mist * air + (1 - mist) * float(air @ _LUMA)
     if rain:
-        light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (0.65 * air - light)
-        light += 0.12 * rain * _rain_streaks(*light.shape[:2])[..., None] * (air - light)
+        light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (1.15 * air - light)
+        light += 0.08 * rain * _rain_streaks(*light.shape[:2])[..., None] * (air - light)
     if fog or snow:
         light += (1 - np.exp(-(_FOG_PER_M * fog + _SNOW_PER_M * snow) * depth)) * (air - light)
     if snow:

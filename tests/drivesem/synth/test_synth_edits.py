@@ -133,7 +133,7 @@ def test_a_turned_deformed_mesh_rises_with_its_lattice(plan):
 
 def test_weather_and_foliage_codes_change_the_whole_street(plan):
     plain = render_frame(plan)
-    foggy = render_frame(apply_edit(plan, FrameEdit(weather=(1.0, 0.0, 0.0, 0.0, 0.0))))
+    foggy = render_frame(apply_edit(plan, FrameEdit(weather=weather(fog=1.0))))
     autumn = render_frame(apply_edit(plan, FrameEdit(foliage=(1.0, 0.0, 0.0))))
     assert plain is not None
     assert foggy is not None
@@ -148,7 +148,7 @@ def test_weather_and_foliage_codes_change_the_whole_street(plan):
 
 @pytest.mark.parametrize("time", [0.5, 1.0])
 def test_sunset_and_twilight_are_the_compositors(plan, time):
-    weather = (0.0, 0.0, time, 0.0, 0.0)
+    weather = (0.0, 0.0, time, 0.0, 0.0, 0.0)
     plain, drawn = render_frame(plan), render_frame(apply_edit(plan, FrameEdit(weather=weather)))
     assert plain is not None
     assert drawn is not None
@@ -319,7 +319,7 @@ def test_file_in_physical_units(tmp_path):
         "      all: {color: [0.1, 0, 0, 0, 0]}\n",
     )
     edits = read_edits(path)
-    assert edits[ALL] == FrameEdit(weather=(0.5, 0, 0, 0, 0), foliage=(-0.5, 0, 0))
+    assert edits[ALL] == FrameEdit(weather=(0.5, 0, 0, 0, 0, 0), foliage=(-0.5, 0, 0))
     assert edits[3].objects[2] == ObjectEdit(
         translate=(0.0, -0.1), translate_m=(0.5, 0.0), rotate=pytest.approx(np.deg2rad(10))
     )

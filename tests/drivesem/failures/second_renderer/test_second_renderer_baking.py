@@ -15,7 +15,7 @@ from drivesem.failures.second_renderer.baking import pack_patches
 from drivesem.failures.second_renderer.geometry import BodyMesh, PictureCamera, VehiclePose
 from scene_ir import ffd
 from scene_ir.geometry import place_vertices, project
-from scene_ir.types import Camera, SceneIR
+from scene_ir.types import WEATHER_DIM, Camera, SceneIR, Weather
 
 
 def test_points_follow_the_conventions(street: Callable[..., SceneIR]) -> None:
@@ -104,6 +104,6 @@ def test_paint_codes_have_their_effect() -> None:
 
 
 def test_shadows_go_under_a_closed_sky() -> None:
-    clear, closed = np.zeros(5, np.float32), np.array([0, 0, 0, 1, 0], np.float32)
+    clear, closed = np.zeros(WEATHER_DIM, np.float32), np.eye(WEATHER_DIM, dtype=np.float32)[Weather.OVERCAST]
     assert shading.remaining_shade(clear) == 1
     assert shading.remaining_shade(closed) == pytest.approx(0.4)
