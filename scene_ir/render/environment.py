@@ -21,7 +21,7 @@ from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
 from scene_ir.render.reflections import mirror_share
-from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab
+from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab, smoothstep
 from scene_ir.types import DAYLIGHT_DIM, Environment, SceneIR, Weather
 
 
@@ -75,6 +75,8 @@ def compute_closed_sky_gain(closed_sky: Tensor, background: Tensor, sky: Tensor,
     guide = np.log(image + np.float32(model.CLOSED_SKY_OFFSET))
     radius = max(2, round(model.CLOSED_SKY_RADIUS * focal_px))
     sharp = cv2.ximgproc.guidedFilter(guide, large, radius, model.CLOSED_SKY_EDGE)
+    burnt = smoothstep(torch.from_numpy(image.max(axis=2)), *model.CLOSED_SKY_BURNT).numpy()[..., None]
+    sharp = sharp + burnt * (sharp.mean(axis=2, keepdims=True) - sharp)
     gain = np.expm1(sharp.clip(-model.CLOSED_SKY_LOG, model.CLOSED_SKY_LOG))
     change = torch.from_numpy(np.ascontiguousarray(gain.transpose(2, 0, 1))).to(background)
     return change * (1.0 - sky.to(change))

@@ -175,6 +175,8 @@ CLOSED_SKY_LOG = 1.5
 """Bound of the logarithm of what a closed sky changes: no pixel becomes more than 4.5 times as bright, or as dark."""
 CLOSED_SKY_OFFSET = 0.02
 """Added to display values before their logarithm is taken."""
+CLOSED_SKY_BURNT = (0.9, 1.0)
+"""Highest channel of a pixel from which, and at which, it has lost its colour: there all channels change alike."""
 CLOSED_SKY_RADIUS, CLOSED_SKY_EDGE = 0.02, 2e-3
 """Guided filter: radius as a share of the focal length, and the variance of the logarithm from which an edge is one.
 """
@@ -264,13 +266,13 @@ each side, and of the farthest.
 """
 STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 7.0
 """Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
-HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (24.0, 210.0, 3.0), (5.5, 14.0), (2.2, 5.5)
+HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (24.0, 210.0, 3.0), (5.5, 14.0), (3.6, 6.5)
 """Lamps at houses and crossings: first and last distance along the street and that between two; distance from the
-camera's path; height.
+camera's path; height, above what a car hides.
 """
 HOUSE_LAMP_RGB = ((1.0, 0.80, 0.50), (1.0, 0.95, 0.85), (0.9, 0.97, 1.0), (0.15, 0.95, 0.55), (1.0, 0.12, 0.08))
 """Their colours: lamps, windows, signs, traffic lights."""
-LAMP_SHOWS = 0.75
+LAMP_SHOWS = 0.9
 """Depth, relative to a lamp's, up to which a surface hides it: depths of a street's sides are estimates."""
 GLOW_RGB = (0.0060, 0.0059, 0.0060)
 """Light of the sky over a town, at the horizon."""
@@ -311,7 +313,7 @@ NIGHT_BEND = 0.02
 
 LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0, 1.2)
 """Rates at which fog, rain, time, overcast, night and snow make drivers switch on their lamps."""
-TAIL_LAMP_RGB, HEADLAMP_RGB = (4.5, 0.16, 0.10), (8.0, 7.2, 6.0)
+TAIL_LAMP_RGB, HEADLAMP_RGB = (3.2, 0.12, 0.08), (8.0, 7.2, 6.0)
 """Light of a lamp that faces the camera by night; white is 1."""
 TAIL_CORE = 0.12
 """Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
@@ -319,11 +321,11 @@ LAMP_STRETCH = (1.5, 0.7)
 """Width and height of a lamp, relative to its radius."""
 BRAKE_LAMP, LAMP_BEND = 2.5, 6.0
 """Light of a brake lamp, relative to a tail lamp's; how sharply lamps code 0 separates off from braking."""
-LAMP_BY_DAY, LAMP_EXPOSURE = 0.12, (0.25, 0.3, 1.2, 0.1, 4.0, 0.2)
+LAMP_BY_DAY, LAMP_EXPOSURE = 0.12, (0.25, 0.3, 0.9, 0.1, 4.0, 0.2)
 """The same by daylight, where the exposure is shorter; rates at which fog, rain, time, overcast, night and snow make it
 longer.
 """
-LAMP_RADIUS_M, LAMP_LEAST_PX = 0.09, 0.7
+LAMP_RADIUS_M, LAMP_LEAST_PX = 0.08, 0.7
 """Radius of a lamp, as the standard deviation of a Gaussian; least such width in the picture."""
 LAMP_FACES = (-0.05, 0.35)
 """Cosine of a lamp's axis to the direction to the camera from which it shows, and shows fully."""

@@ -166,13 +166,13 @@ def find_lit(rgb: np.ndarray, open_to: np.ndarray) -> np.ndarray:
 
 
 def _missed_sky(rgb: np.ndarray, sky: np.ndarray, leaves: np.ndarray) -> np.ndarray:
-    """How far (H, W) a pixel shows day's sky, though the map of the sky does not have it: in the gaps of leaves, and
-    where that map ends.
+    """How far (H, W) a pixel shows day's sky, though the map of the sky does not have all of it: in the gaps of leaves,
+    and where that map ends.
     """
-    reach = max(3, rgb.shape[0] // 5)
-    around = cv2.dilate((sky > 0.5).astype(np.float64), np.ones((reach, reach)))
     grey = rgb.mean(axis=2)
-    return np.maximum(leaves * _ramp(grey, 0.35, 0.65), around * _ramp(grey, 0.5, 0.75))
+    size = max(3, rgb.shape[0] // 24) | 1
+    gaps = grey - cv2.morphologyEx(grey, cv2.MORPH_OPEN, np.ones((size, size)))
+    return np.maximum(leaves * _ramp(gaps, 0.1, 0.3), _ramp(sky, 0.0, 0.1) * _ramp(grey, 0.5, 0.75))
 
 
 def _street_light(aside_m: np.ndarray, depth_m: np.ndarray) -> np.ndarray:

@@ -27,13 +27,13 @@ from drivesem.config.edits import WEATHER_CODES, FrameEdit
 from drivesem.failures.margins import object_margins
 from drivesem.reporting.drawing import write_picture
 from drivesem.synth import frames as generated
-from drivesem.synth.edits import apply_edit
+from drivesem.synth.edits import DRAWN_WEATHER, apply_edit
 from drivesem.synth.frames import SPLITS, Plan, SynthFrame, SynthSettings, Truth
 from scene_ir.derender.derender import VEHICLE_CATEGORIES, derender
 from scene_ir.io import to_uint8
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.model import LUMA, SUN_RISE_RAD, SUN_STRENGTH, SUN_TURN_RAD
-from scene_ir.types import DAYLIGHT_DIM, Frame, SceneIR
+from scene_ir.types import Frame, SceneIR, Weather
 from tools.bench.pictures import SheetStrip, psnr, sheet
 from tools.bench.settings import BenchTool
 
@@ -62,11 +62,11 @@ _SUN_CORNERS = ((1, 1, 1), (1, -1, 1), (-1, 1, -1), (-1, -1, -1))
 CODES: dict[str, FrameEdit] = {
     "none": FrameEdit(),
     **{
-        f"{name} {code:g}": FrameEdit(weather=tuple(code if n == name else 0.0 for n in WEATHER_CODES))
-        for name in WEATHER_CODES[:DAYLIGHT_DIM]
-        for code in (0.5, 1.0)
+        f"{WEATHER_CODES[code]} {amount:g}": FrameEdit(weather=tuple(amount * (other == code) for other in Weather))
+        for code in DRAWN_WEATHER
+        for amount in (0.5, 1.0)
     },
-    "fog and rain 0.5": FrameEdit(weather=(0.5, 0.5, 0, 0, 0)),
+    "fog and rain 0.5": FrameEdit(weather=tuple(0.5 * (code in (Weather.FOG, Weather.RAIN)) for code in Weather)),
     **{
         f"sun {degrees} degrees to the {side}": FrameEdit(sun=(sign * math.radians(degrees) / SUN_TURN_RAD, 0, 0))
         for degrees in (20, 40, 60)
