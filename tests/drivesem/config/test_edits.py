@@ -272,7 +272,9 @@ def test_no_change_keeps_every_bit(street: Street) -> None:
     after = apply_changes(scene, edit_of("objects[all].rotate=0deg"))
     assert torch.equal(after.objects.translation, scene.objects.translation)
     assert torch.equal(after.objects.yaw, scene.objects.yaw)
-    assert apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0, 0, 0))).environment.weather[0] == 1
+    assert (
+        apply_changes(street(positions_xz=()), FrameEdit(weather=(1.0, 0, 0, 0, 0, 0))).environment.weather[0] == 1
+    )
 
 
 def test_removal_names_rows(street: Street) -> None:
