@@ -35,7 +35,7 @@ def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
 
 
 def shadow_softening(weather: Tensor) -> Tensor:
-    """Factor () by which weather and night weaken cast shadows; 1 at code 0. weather: (5,)."""
+    """Factor () by which weather and night weaken cast shadows; 1 at code 0. weather: (6,)."""
     return torch.exp(-(weather.new_tensor(model.SHADOW_SOFTENING) * weather).sum())
 
 
