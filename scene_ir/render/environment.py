@@ -20,7 +20,7 @@ from scene_ir.geometry import clamp_inclusive, height_above_ground
 from scene_ir.image_filters import push_pull
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
-from scene_ir.render.reflections import mirror_share
+from scene_ir.render.reflections import by_row, mirror_share
 from scene_ir.render.texture import lab_to_soft_rgb, rgb_to_lab, smoothstep
 from scene_ir.types import DAYLIGHT_DIM, Environment, SceneIR, Weather
 
@@ -36,7 +36,7 @@ def sky_colour(photograph: Tensor, sky: Tensor) -> Tensor:
 
 
 def shadow_softening(weather: Tensor) -> Tensor:
-    """Factor () by which weather and night weaken cast shadows; 1 at code 0. weather: (5,)."""
+    """Factor () by which weather and night weaken cast shadows; 1 at code 0. weather: (6,)."""
     return torch.exp(-(weather.new_tensor(model.SHADOW_SOFTENING) * weather).sum())
 
 
@@ -185,7 +185,8 @@ def apply_weather(
     """
     weather, snow = _daylight_codes(environment.weather.to(image)), environment.weather[Weather.SNOW].to(image)
     if snow.requires_grad or bool(snow.detach() != 0):
-        image = image + (model.SLUSH * snow) * environment.road.to(image) * (model.SLUSH_LIGHT - image)
+        slush = by_row(model.SLUSH * snow, image.shape[1]) * environment.road.to(image)
+        image = image + slush * (model.SLUSH_LIGHT - image)
     streaks = _rain_streaks(*environment.sky.shape).to(image)
     inputs = (image, inverse_depth, weather, air, environment, mirrored, streaks)
     if backend == "warp":
@@ -205,7 +206,7 @@ def add_flakes(image: Tensor, inverse_depth: Tensor, environment: Environment, a
     opacity = ((depth / nearest - 1.0).clamp(0.0, 1.0) * layers).sum(dim=0)
     weather = environment.weather.to(image)
     lit = model.FLAKE_LIGHT * _weathered_air(air, _daylight_codes(weather))[:, None, None]
-    return image + (weather[Weather.SNOW] * opacity.clamp(max=1.0)) * (lit - image)
+    return image + by_row(weather[Weather.SNOW], len(opacity)) * opacity.clamp(max=1.0) * (lit - image)
 
 
 def _daylight_codes(weather: Tensor) -> Tensor:

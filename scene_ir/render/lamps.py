@@ -45,7 +45,7 @@ class VehicleLamps:
 
 
 def lamps_on(weather: Tensor) -> Tensor:
-    """How far () drivers have their lamps on in a weather (5,): 0 at code 0, near 1 by night and in dense fog."""
+    """How far () drivers have their lamps on in a weather (6,): 0 at code 0, near 1 by night and in dense fog."""
     return -torch.expm1(-(weather.new_tensor(model.LAMPS_ON) * weather).sum().square())
 
 

@@ -213,7 +213,7 @@ by water.
 """
 SHEEN_MIRROR, SHEEN_AIR = 0.85, 0.15
 """Parts of what a wet road mirrors: the smeared picture, and light from all around."""
-MIRROR_ROWS, MIRROR_REACH, MIRROR_SLACK = 180, 0.05, 0.05
+MIRROR_ROWS, MIRROR_REACH, MIRROR_SLACK = 125, 0.07, 0.05
 """Rows of the mirrored picture; share of them over which the road smears it, twice; slack of the search for what a ray
 meets, relative to its slope.
 """

@@ -22,7 +22,7 @@ from scene_ir.geometry import height_above_ground
 from scene_ir.raster.verbs import Backend
 from scene_ir.render import model
 from scene_ir.render.channels import AIM, CORNER, GLARE, NIGHT_MAPS, NOISE, RISE, STREET, WET
-from scene_ir.render.reflections import mirror_in_ground, mirror_share
+from scene_ir.render.reflections import by_row, mirror_in_ground, mirror_share
 from scene_ir.types import Environment, SceneIR, Weather
 
 
@@ -121,7 +121,9 @@ def apply_night(
     share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) * (night.by_day / math.expm1(-model.NIGHTFALL))
     growth = 1.0 + model.GLARE_FOG * code[Weather.FOG] + model.GLARE_RAIN * code[Weather.RAIN]
     sky, maps = environment.sky.to(image), night.maps.to(image)
-    lamps = lamps + (share * code[Weather.RAIN]) * environment.road.to(image) * maps[WET:NIGHT_MAPS]
+    lamps = (
+        lamps + by_row(share * code[Weather.RAIN], len(sky)) * environment.road.to(image) * maps[WET:NIGHT_MAPS]
+    )
     if backend == "warp":
         from scene_ir.render.kernels import night as kernels
 

@@ -37,10 +37,18 @@ def mirror_in_ground(
         reached = (2.0 * camera_m * inverse + climb).masked_fill(flat > 0.5, -torch.inf)
         rows = _first_above(reached, -climb * (1.0 + model.MIRROR_SLACK))
     mirrored = small.gather(1, rows.expand(len(values), *rows.shape))
-    reach = max(1, round(model.MIRROR_REACH * len(rows))) // 2
+    reach = round(model.MIRROR_REACH * len(rows) / 2)
+    mirrored = pad(mirrored[None], (2, 2, 2 * reach, 2 * reach), "replicate")
     for _ in range(2):
-        mirrored = avg_pool2d(pad(mirrored[None], (1, 1, reach, reach), "replicate"), (2 * reach + 1, 3), 1)[0]
-    return interpolate(mirrored[None], scale_factor=step, mode="bilinear")[0, :, :height, :width]
+        mirrored = avg_pool2d(avg_pool2d(mirrored, (2 * reach + 1, 1), 1), (1, 3), 1)
+    return interpolate(mirrored, scale_factor=step, mode="bilinear")[0, :, :height, :width]
+
+
+def by_row(amount: Tensor, height: int) -> Tensor:
+    """An amount () for each row, (height, 1): its gradient is summed row by row, so that the sum does not depend on the
+    number of threads.
+    """
+    return amount.expand(height)[:, None]
 
 
 def mirror_share(depth: Tensor, camera_m: Tensor | float) -> Tensor:

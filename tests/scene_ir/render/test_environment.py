@@ -136,6 +136,25 @@ def test_weather_stays_in_range_and_is_deterministic() -> None:
     assert torch.equal(after, _weather(code)[1])
 
 
+def test_flakes_fall_in_front_of_what_is_farther() -> None:
+    image, _, scenery, air = _inputs()
+    snowy = replace(scenery, weather=torch.tensor([0, 0, 0, 0, 0, 1.0], dtype=image.dtype))
+    near, far = (
+        env.add_flakes(image, torch.full((H, W), 1 / depth_m, dtype=image.dtype), snowy, air)
+        for depth_m in (model.FLAKE_M[0], 300.0)
+    )
+    assert torch.equal(near, image)
+    assert float((far != image).double().mean()) > 0.5
+    assert bool(((far >= image) | (image > 0.9 * air.min())).all())
+
+
+def test_snow_pales_the_road_and_closes_the_sky() -> None:
+    image, after = _weather(_code(SNOW, 1.0))
+    road, sky = _inputs()[2].road > 0, _inputs()[2].sky > 0
+    assert float(after[:, road].mean()) > float(image[:, road].mean()) + 0.05
+    assert float(after[:, sky].std()) < 0.5 * float(image[:, sky].std())
+
+
 def test_foliage_changes_nothing_else() -> None:
     image, after = _foliage(torch.tensor([0.8, -0.4, 0.5], dtype=torch.float64))
     outside = _inputs()[2].foliage_map == 0

@@ -43,6 +43,12 @@ def test_first_above_agrees_with_a_loop() -> None:
             assert int(found[row, column]) == max(reached, default=0)
 
 
+def test_a_wet_road_mirrors_more_the_flatter_it_is_seen() -> None:
+    shares = reflections.mirror_share(torch.tensor([2.0, 8.0, 30.0, 300.0]), CAMERA_M)
+    assert bool((shares.diff() > 0).all())
+    assert float(shares[-1]) <= reflections.model.FILM
+
+
 def test_it_is_differentiable_to_the_picture() -> None:
     inverse, ground, rise = _street(9, 8, 10.0)
     picture = torch.rand(4, 9, 8, dtype=torch.float64).requires_grad_()

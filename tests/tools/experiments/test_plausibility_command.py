@@ -109,7 +109,7 @@ def test_weather_and_what_of_it_comes_together(run: Path, output_json: Callable[
     assert [frame["weather"] for frame in data["by_frame"]] == [1.5, None]
     assert data["weather_beyond"] == ["a"]
     written = (run / "plausibility" / "plausibility.md").read_text()
-    assert "| a | 0.75 | 0.75 | 0.00 | 0.50 | 0.00 | 150.0 | fog in rain or snow |" in written
+    assert "| a | 0.75 | 0.75 | 0.00 | 0.50 | 0.00 | 0.00 | 150.0 | fog in rain or snow |" in written
 
 
 def test_a_bad_folder_or_labels_that_do_not_fit_are_refused(
