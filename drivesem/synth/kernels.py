@@ -498,7 +498,7 @@ def lamplight(s: Spot, air: Air):
 
 @wp.func
 def glints(s: Spot, air: Air, rough: float, reflectance: float):
-    """Radiance of all lamps in a coat whose microfacets' slopes have the width `rough` (Trowbridge and Reitz)."""
+    """Radiance of all lamps in a coat of microfacets, with slopes of the width `rough` (Trowbridge and Reitz)."""
     total = wp.vec3f()
     back = -wp.normalize(s.point)
     seen = wp.max(wp.dot(s.normal, back), 1e-3)

@@ -24,7 +24,7 @@ BEAM_WIDE, BEAM_CUT, BEAM_EDGE, BEAM_DOWN = 0.30, 0.008, 0.03, 0.11
 over which it fades further below. Source: the shape of UN regulation 112's limits.
 """
 BEAM_FLOOD, FLOOD_WIDE, BEAM_STRAY = 0.10, 0.9, 0.012
-"""Light beside the beam: share and width of the flood, and the share that goes everywhere ahead."""
+"""Light outside of the beam: share and width of the flood, and the share that goes everywhere ahead."""
 RETRO, RETRO_RAD = 260.0, 0.012
 """Gain of retro-reflective sheeting on light that comes from the viewer's direction, and the angle off that at which it
 has halved. Source: EN 12899-1, about 100 cd / lx / m2 at half a degree.

@@ -33,7 +33,7 @@ _BEAM_RAD, _CUT, _CUT_WIDTH, _DROP, _STRAY = 0.30, 0.012, 0.006, 0.12, 0.014
 """Their beam: half width, sine below the horizon where it is cut off, width of that edge, sine over which it fades
 below, share that is scattered everywhere."""
 _MATT, _BACKWARD = 0.6, 0.4
-"""Cosine that stands for that of surfaces whose normal is unknown; share of the road's light that goes back at grazing
+"""Cosine that stands for that of surfaces with an unknown normal; share of the road's light that goes back at grazing
 angles."""
 _SIGN_SATURATION, _SIGN_GAIN = (0.55, 0.75), 12.0
 """Saturation from which a bright, compact area may be a sign, and is; its gain on the headlamps' light."""
@@ -202,10 +202,10 @@ def _stands_in_traffic(pose: VehiclePose, environment: Environment, camera: Pict
     if abs(x) < half + 0.6:
         return 1.0
     side = np.sign(x) * np.sign(float(pose.rotation()[0, 2])) or 1.0
-    beside = np.array(
+    outside = np.array(
         [[along * pose.size_lhw[0], 0, side * (half + 1.2)] for along in (-0.35, 0, 0.35)], np.float32
     )
-    at = camera.project(beside @ pose.rotation().T + pose.translation + camera.shift_m)
+    at = camera.project(outside @ pose.rotation().T + pose.translation + camera.shift_m)
     limit = np.array([camera.width, camera.height]) - 1
     inside = at[((at >= 0) & (at <= limit)).all(axis=1)].round().astype(int)
     road = to_numpy(environment.road)

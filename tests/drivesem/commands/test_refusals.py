@@ -123,6 +123,7 @@ REFUSALS = [
     ("synth --frames 0", "--frames: expected at least 1, found 0"),
     ("synth --sequence 0", "--sequence: expected at least 1, found 0"),
     ("synth --validation 1.5", "--validation: expected a fraction in [0, 1), found 1.5"),
+    ("synth --night 1.5", "--night: expected a fraction in [0, 1], found 1.5"),
     ("synth --cameras 2", "--cameras: expected 1, or --layout vkitti2, found 2"),
     ("synth --layout vkitti2 --people True", "--people: expected False with --layout vkitti2, ... found True"),
     ("synth --variations night", "variations: expected all, or names among mixed, clone, ... found 'night'"),

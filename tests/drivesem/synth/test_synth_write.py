@@ -16,7 +16,7 @@ from drivesem.synth import write
 from drivesem.synth.exposure import CLASS_NAMES, expose
 from drivesem.synth.frames import VARIANTS, SynthSettings, apply_variation, boxes_alone, plan_frame, render_frame
 from drivesem.synth.layout import LayoutSettings
-from drivesem.synth.write import Order, synthesise
+from drivesem.synth.write import Order, list_jobs, plan_job, synthesise
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.meshes.load import save_mesh
@@ -286,3 +286,11 @@ def test_a_sliver_of_a_car_at_the_border_has_no_track(tmp_path):
     assert listed
     assert listed <= {entry.track + 1 for entry in exposure.objects}
     WRITERS["vkitti1"](tmp_path).write(order.places()[198], exposure)
+
+
+def test_a_share_of_nights_is_part_of_the_recipe(tmp_path):
+    assert "night" not in Order(tmp_path, 1).recipe()
+    assert Order(tmp_path, 1, night=0.5).recipe()["night"] == 0.5
+    job = list_jobs(Order(tmp_path, 1, night=1.0))[0]
+    assert plan_job(job).setting.light.night > 0.9
+    assert plan_job(list_jobs(Order(tmp_path, 1))[0]).setting.light.night == 0
