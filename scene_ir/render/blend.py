@@ -103,7 +103,7 @@ def visible_background(opacity: Tensor, plan: BlendPlan, frame_hw: tuple[int, in
     for i in plan.order:
         packed, (rows, columns), size = plan.spans[i]
         # A copy: autograd needs the factors that are overwritten.
-        shows[rows, columns] = shows[rows, columns].clone() * (1.0 - opacity[packed].reshape(size)).clamp(min=0.0)
+        shows[rows, columns] = shows[rows, columns].clone() * (1.0 - opacity[packed].reshape(size))
     return shows
 
 

@@ -142,7 +142,9 @@ def apply_night(
     headlit = head * colours[1] * (day + model.RETRO_WHITE * day.pow(3))
     light = (surface * shone + headlit) * (1.0 - sky) + sky * maps[STREET] * colours[3] + growth * maps[GLARE:WET]
     bend = model.NIGHT_BEND**2
-    dark = image + (torch.sqrt(day + share * (light - day) + lamps + bend) - torch.sqrt(day + bend))
+    # Lamps on a road that a vehicle hides with an opacity beyond 1 are slightly negative.
+    dark_light = (day + share * (light - day) + lamps).clamp(min=0.0)
+    dark = image + (torch.sqrt(dark_light + bend) - torch.sqrt(day + bend))
     seen = dark * (1.0 - share * maps[CORNER])
     return seen + share * maps[NOISE:GLARE] * (model.NOISE + model.NOISE_LEVEL * seen)
 

@@ -57,6 +57,21 @@ def _retro_day(day: wp.vec3f):
 
 
 @wp.func
+def _not_negative(light: wp.vec3f):
+    """Light; lamps on a road that a vehicle hides with an opacity beyond 1 are slightly negative."""
+    return wp.vec3f(wp.max(light[0], 0.0), wp.max(light[1], 0.0), wp.max(light[2], 0.0))
+
+
+@wp.func
+def _slope_above_zero(light: wp.vec3f):
+    return wp.vec3f(
+        wp.where(light[0] >= 0.0, 1.0, 0.0),
+        wp.where(light[1] >= 0.0, 1.0, 0.0),
+        wp.where(light[2] >= 0.0, 1.0, 0.0),
+    )
+
+
+@wp.func
 def _street_light(street: wp.float32, lit: wp.float32):
     return street * STREET_RGB + _splat(LIT_GAIN * lit)
 
@@ -91,8 +106,8 @@ def _night_kernel(
         + load(sky, i) * (street * GLOW_RGB - lamps)
         + load(settings, 1) * load3(maps, GLARE * plane + i, plane)
     )
-    added = load3(vehicles, i, plane) + _splat(BEND)
-    dark = x + (_sqrt3(day + share * (light - day) + added) - _sqrt3(day + _splat(BEND)))
+    dark_light = _not_negative(day + share * (light - day) + load3(vehicles, i, plane))
+    dark = x + (_sqrt3(dark_light + _splat(BEND)) - _sqrt3(day + _splat(BEND)))
     seen = (1.0 - share * load(maps, CORNER * plane + i)) * dark
     noise = share * load3(maps, NOISE * plane + i, plane)
     store3(out, i, plane, seen + wp.cw_mul(noise, _splat(NOISE_BLACK) + NOISE_LEVEL * seen))
@@ -138,8 +153,8 @@ def _night_adjoint_kernel(
     lamps = wp.cw_mul(surface, colour) + head * wp.cw_mul(retro, HEAD_RGB)
     glare = load3(maps, GLARE * plane + i, plane)
     light = lamps + open_sky * (street * GLOW_RGB - lamps) + load(settings, 1) * glare
-    added = load3(vehicles, i, plane) + _splat(BEND)
-    root = _sqrt3(day + share * (light - day) + added)
+    dark_light = day + share * (light - day) + load3(vehicles, i, plane)
+    root = _sqrt3(_not_negative(dark_light) + _splat(BEND))
     day_root = _sqrt3(day + _splat(BEND))
     dark = x + (root - day_root)
     corner = load(maps, CORNER * plane + i)
@@ -150,7 +165,7 @@ def _night_adjoint_kernel(
     g = load3(grad, i, plane)
     g_seen = g + (share * NOISE_LEVEL) * wp.cw_mul(g, noise)
     g_dark = keep * g_seen
-    g_sum = wp.cw_div(0.5 * g_dark, root)
+    g_sum = wp.cw_mul(_slope_above_zero(dark_light), wp.cw_div(0.5 * g_dark, root))
     g_light = share * g_sum
     g_lamps = (1.0 - open_sky) * g_light
     g_colour = wp.cw_mul(g_lamps, surface)
