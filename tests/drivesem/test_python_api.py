@@ -172,7 +172,9 @@ def test_a_scene_says_what_is_changed(scene: ds.Scene) -> None:
         },
         abs=1e-5,
     )
-    assert changed.weather == pytest.approx({"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4, "night": 0})
+    assert changed.weather == pytest.approx(
+        {"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4, "night": 0, "snow": 0}
+    )
     by_night = scene.edit("objects[1].lamps=off", weather="fog=0.6,night=1")
     assert by_night.theta == pytest.approx({"weather.fog": 0.6, "weather.night": 1.0, "objects[1].lamps": -1.0})
     assert scene.edit(weather="night").render().mean() < 0.5 * scene.render().mean()
