@@ -17,6 +17,7 @@ from drivesem.failures.second_renderer.geometry import PictureCamera, VehiclePos
 from drivesem.failures.second_renderer.opengl import Array
 from scene_ir.types import Environment, Weather
 
+Floats = NDArray[np.floating]
 GAMMA = 2.2
 _FARTHEST_M = 300.0
 """Distance that stands for the sky's."""
@@ -136,12 +137,12 @@ def _light_by_night(
     level = float(np.median(light[road > 0.5])) if (road > 0.5).sum() > 500 else 0.2
     albedo = np.clip(light / np.clip(level / _ROAD_ALBEDO, *_DAYLIGHT), 0, 0.9)
 
-    def lit_by(intensity: Array, away: Array, square: Array) -> Array:
+    def lit_by(intensity: Floats, away: Floats, square: Floats) -> Floats:
         slope = np.where(flat, np.clip(-(away @ up), 0, 1), _MATT)
         back = np.where(flat, 1 - _BACKWARD + _BACKWARD / np.maximum(slope + seen, 1e-2), 1)
         return intensity * slope * back / (square + 0.1)
 
-    def from_lamp(place: Array) -> tuple[Array, Array]:
+    def from_lamp(place: Floats) -> tuple[Floats, Floats]:
         away = points - place
         square = np.square(away).sum(axis=2)
         return away / np.sqrt(square + 1e-6)[..., None], square
@@ -190,7 +191,8 @@ def _find_windows(light: Array, leaves: Array) -> Array:
     bright = (light.min(axis=2) ** (1 / GAMMA) > _WINDOW).astype(np.uint8)
     # edges and wires are thin
     solid = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    large = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((size, size), np.uint8)) | (leaves > 0.2)
+    opened = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    large = np.maximum(opened, (leaves > 0.2).astype(np.uint8))
     near = cv2.dilate(large, np.ones((2 * size + 1,) * 2, np.uint8))
     return solid * (1.0 - near).astype(np.float32)
 
@@ -220,7 +222,7 @@ def _draw_lamps(
     camera: PictureCamera,
     ground: Array,
     extinction: float,
-    levels: Array,
+    levels: Floats,
 ) -> None:
     """Add the light of a vehicle's visible lamps, at usual places of its box, and their images on a wet road.
 
@@ -251,7 +253,7 @@ def _draw_lamps(
 
 
 def _draw_spot(
-    light: Array, place: Array, radius_m: float, camera: PictureCamera, colour: Array, where: NDArray[np.bool_]
+    light: Array, place: Floats, radius_m: float, camera: PictureCamera, colour: Floats, where: NDArray[np.bool_]
 ) -> None:
     """Add the light of a lamp that is brightest in its middle to (H, W, 3), where it may be seen."""
     x, y = camera.project(place.astype(np.float32)).tolist()
@@ -263,7 +265,7 @@ def _draw_spot(
     light += np.where(where, spot, 0)[..., None] * colour.astype(np.float32)
 
 
-def _draw_streak(mirrored: Array, place: Array, below: Array, camera: PictureCamera, colour: Array) -> None:
+def _draw_streak(mirrored: Floats, place: Floats, below: Floats, camera: PictureCamera, colour: Floats) -> None:
     """Add a lamp's image on a wet road to (H, W, 3): waves tilt the mirror, so that it is drawn out towards the
     camera.
     """
