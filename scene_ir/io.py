@@ -117,6 +117,8 @@ def save_scene(scene: SceneIR, folder: Path, lossy: bool = False) -> None:
     with files.atomic_folder(Path(folder)) as temporary:
         arrays = {"depth": _array(scene.depth)}
         arrays |= {name: _array(getattr(scene.environment, name)) for name in _MAPS}
+        if scene.environment.ego is not None:
+            arrays["ego"] = _array(scene.environment.ego)
         in_png = {}
         for name in _IMAGES:
             image = getattr(scene, name).detach().cpu()
@@ -200,6 +202,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
                 for name, width in _ENVIRONMENT_FIELDS.items()
             },
             **{name: arrays.tensor(name, *size) for name in _MAPS},
+            ego=arrays.tensor("ego", *size) if "ego" in arrays else None,
         )
     )
     meshes = tuple(_load_mesh(folder / "meshes" / f"{i}.glb") for i in range(root["meshes"].integer()))

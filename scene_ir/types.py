@@ -322,6 +322,9 @@ class Environment:
     """(H, W) in [0, 1], share of road."""
     light: Tensor = field(default_factory=lambda: torch.zeros(LIGHT_DIM))
     """(3,) in [-1, 1]; 0 is as photographed."""
+    ego: Tensor | None = None
+    """(H, W) in [0, 1], opacity of the ego vehicle (bonnet, dashboard), which no code changes; None if the photograph
+    does not show it."""
 
     def __post_init__(self) -> None:
         if isinstance(self.weather, Tensor) and self.weather.shape == (DAYLIGHT_DIM,):
@@ -335,6 +338,8 @@ class Environment:
         check_shape("environment.sky", self.sky, None, None)
         check_shape("environment.foliage_map", self.foliage_map, *self.sky.shape)
         check_shape("environment.road", self.road, *self.sky.shape)
+        if self.ego is not None:
+            check_shape("environment.ego", self.ego, *self.sky.shape)
         for name in ("weather", "foliage", "light", "sun", "ground"):
             check_finite(f"environment.{name}", getattr(self, name))
 

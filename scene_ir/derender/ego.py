@@ -1,0 +1,106 @@
+"""Find the ego vehicle in a photograph: its bonnet, dashboard, wipers and pillars, as dashcams show them.
+
+A small network (`unet`), trained on generated streets with drawn ego vehicles, sees the whole photograph. Most
+photographs show none.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scene_ir.derender.unet import NetworkInput, UNet
+from scene_ir.weights import load_frozen
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+WEIGHTS = Path(__file__).parent / "weights" / "ego.safetensors"
+"""The shipped weights, made by `tools/train_ego.py`."""
+CLASS_NAME = "ego vehicle"
+"""Its name among a data set's classes (Cityscapes)."""
+INPUT_HW = (112, 224)
+"""Size of the network's input, whatever the photograph's."""
+DEPTH_M = 0.3
+"""Depth of the ego vehicle, m: nearer than all that it hides."""
+_PENALTY = 1.0
+"""Subtracted from the log odds: half of the training pictures show an ego vehicle, and a false one costs more than a
+missed one."""
+_RADIUS, _FLATNESS = 0.012, 3e-4
+"""Guided filter: radius as a share of the photograph's height, and the variance of colour below which a surface is
+uniform."""
+_MIN_SHARE = 0.004
+"""Parts and holes smaller than this share of the photograph are noise."""
+
+
+class EgoNet(UNet):
+    """RGB (N, 3, 112, 224) in [0, 1] and rows (N, 1, 112, 224), see `row_map` -> logits (N, 1, 56, 112)."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+
+@lru_cache(maxsize=2)
+def load_network(path: Path = WEIGHTS) -> EgoNet:
+    """The network of a weights file, in eval mode. Raises FormatError."""
+    network = load_frozen(EgoNet(), path)
+    return network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+
+def row_map(count: int) -> Tensor:
+    """Rows (count, 1, h, w) of the network's pixels, 0.5 at the top and -0.5 at the bottom."""
+    height, width = INPUT_HW
+    return torch.linspace(0.5, -0.5, height)[:, None].expand(count, 1, height, width)
+
+
+def find_ego_vehicle(image: Array, network: EgoNet | None = None) -> Mask | None:
+    """Find the ego vehicle in a photograph.
+
+    Args:
+        image: (H, W, 3) RGB float32 in [0, 1].
+        network: In place of the shipped one.
+
+    Returns:
+        Its pixels (H, W); None if the photograph does not show it.
+    """
+    height, width = image.shape[:2]
+    small = np.asarray(cv2.resize(image, INPUT_HW[::-1], interpolation=cv2.INTER_AREA), np.float32)
+    view = NetworkInput(small, row_map(1)[0, 0].numpy())
+    share = (network or load_network()).predict(view)[0, 0].sub(_PENALTY).sigmoid().numpy()
+    if share.max() < 0.5:
+        return None
+    large = cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR)
+    soft = cv2.ximgproc.guidedFilter(image * 255, large, max(2, round(_RADIUS * height)), _FLATNESS * 255**2)
+    mask = _keep_border_parts(soft > 0.5)
+    return mask if mask.any() else None
+
+
+def _keep_border_parts(mask: Mask) -> Mask:
+    """The connected parts of a mask (H, W) that reach the picture's border, without small ones and small holes."""
+    least_px = _MIN_SHARE * mask.size
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
+    large = [k for k in range(1, count) if k in border and stats[k, cv2.CC_STAT_AREA] >= least_px]
+    mask = np.isin(parts, large)
+    count, parts, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
+    small = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] < least_px]
+    return mask | np.isin(parts, small)
+
+
+def ignored_regions(mask: Mask) -> Tensor:
+    """Boxes (K, 4) px, xyxy, in which no detection counts: for each part of a mask (H, W) its bounding box, cut to the
+    rows of which it fills at least half.
+    """
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    boxes = []
+    for number, (x0, y0, width, height, _) in enumerate(stats.tolist()):
+        rows = np.flatnonzero((parts[y0 : y0 + height, x0 : x0 + width] == number).mean(1) >= 0.5)
+        if number and len(rows):
+            boxes.append((x0, y0 + int(rows[0]), x0 + width - 1, y0 + int(rows[-1])))
+    return torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4)
