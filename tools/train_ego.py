@@ -275,7 +275,7 @@ def make_picture(
 class EgoSettings:
     """What decides on the result of a run."""
 
-    steps: int = 2000
+    steps: int = 1500
     batch: int = 8
     frames: int = 300
     """Of the training set."""
@@ -318,9 +318,7 @@ class EgoRun(AveragedRun[EgoNet]):
         with self.timed():
             images, shares = build_batch(store, step, settings)
             warm = min(1.0, (step + 1) / 50)
-            with torch.autocast("cpu", torch.bfloat16):
-                logits = self.network(images, ego.row_map(len(images)))
-            loss = compute_loss(logits.float(), shares)
+            loss = compute_loss(self.network(images, ego.row_map(len(images))), shares)
             self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
         return float(loss.detach())
 
