@@ -102,10 +102,8 @@ class EgoPainter:
             sides = np.abs(self.u) ** (2 if corner < 0.75 else 8)
             wave = self.uniform(0, 0.06) * np.cos(self.uniform(4, 14) * self.u + self.uniform(0, 6))
             top = self.height - rise * (1 - curve * sides - tilt * self.u + wave * (self.rng.random() < 0.4))
-            if self.chance(0.5 if band == 0 else 0.15):
-                colour = self.bonnet(street, top)
-            else:
-                colour = self.plastic(top)
+            lacquered = self.chance(0.5 if band == 0 else 0.15)
+            colour = self.bonnet(street, top) if lacquered else self.plastic(top)
             self.blend(colour, np.clip(self.v - top + 0.5, 0, 1))
             if self.chance(0.35):  # a gap or a lit edge
                 line = np.clip(1.2 - np.abs(self.v - top - self.uniform(0, 3)), 0, 1)
@@ -161,9 +159,7 @@ class EgoPainter:
         end = (x + math.copysign(length, self.width / 2 - x) * math.cos(angle), y + length * math.sin(angle))
         self.draw_bar((x, y), end, self.uniform(0.7, 2.2), self.uniform(0, 0.15))
 
-    def draw_bar(
-        self, start: tuple[float, float], end: tuple[float, float], half_px: float, level: float
-    ) -> None:
+    def draw_bar(self, start: tuple[float, float], end: tuple[float, float], half_px: float, level: float) -> None:
         """A bar of a grey level between two points (x, y), half_px thick to either side."""
         x, y = np.arange(self.width, dtype=np.float32)[None] - start[0], self.v - start[1]
         dx, dy = end[0] - start[0], end[1] - start[1]
@@ -251,10 +247,10 @@ def random_part(store: SegmentStore, index: int, rng: np.random.Generator) -> tu
 
 
 def make_picture(
-    parts: tuple[np.ndarray, ...], rng: np.random.Generator, shown: bool
+    parts: tuple[np.ndarray, ...], rng: np.random.Generator, has_ego: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A training picture (h, w, 3) in [0, 1] and the ego vehicle's share (h, w). parts: see `random_part`; shown:
-    whether there is an ego vehicle.
+    """A training picture (h, w, 3) in [0, 1] and the ego vehicle's share (h, w). parts: see `random_part`;
+    has_ego: whether to draw an ego vehicle.
     """
     image, classes, elevation = parts
     vary_colours(image, classes, elevation, rng)
@@ -262,7 +258,7 @@ def make_picture(
     vary_light(image, classes, rng)
     if rng.random() < 0.25:
         draw_shade(image, rng)
-    coverage = draw_ego(image, rng) if shown else np.zeros(image.shape[:2], np.float32)
+    coverage = draw_ego(image, rng) if has_ego else np.zeros(image.shape[:2], np.float32)
     if rng.random() < 0.3:
         draw_glass_reflection(image, rng)
     image = vary_camera(image, rng)
@@ -333,10 +329,10 @@ def judge(network: EgoNet, store: SegmentStore, pictures: int) -> dict[str, floa
     rows, wrong = [], []
     for index in range(pictures):
         rng = np.random.default_rng([STREAM, HELD_SEED, index])
-        shown = index % 2 == 0
-        image, coverage = make_picture(random_part(store, index % len(store), rng), rng, shown)
+        has_ego = index % 2 == 0
+        image, coverage = make_picture(random_part(store, index % len(store), rng), rng, has_ego)
         mask, truth = ego.find_ego_vehicle(image, network), coverage > 0.5
-        if not shown:
+        if not has_ego:
             wrong.append(mask is not None)
             continue
         mask = np.zeros(INPUT_HW, bool) if mask is None else mask
@@ -355,8 +351,8 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 - Architecture: `scene_ir.derender.ego.EgoNet`, {parameters:,} parameters: the segmenter's U-Net on the whole picture at
   {height} x {width} px and each pixel's row. One class: the ego vehicle.
 - Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
-- Data: {frames:,} frames of the project's own generator, version {version}, by KITTI's cameras and by dashcams, in all its
-  weathers and seasons; no photographs. Over half of the pictures the ego vehicle is drawn: bands of bonnet, cowl and
+- Data: {frames:,} frames of the project's own generator, version {version}, by KITTI's cameras and by dashcams,
+  in all its weathers and seasons; no photographs. Over half of the pictures the ego vehicle is drawn: bands of bonnet, cowl and
   dashboard of many shapes, wipers, objects on the dashboard, pillars, mirrors. All pictures: other colours, light,
   shade on the road, unknown objects, faint reflections on the glass, other cameras, noise, compression, darkness.
 - Training: {steps:,} steps of {batch} pictures, {minutes:.0f} minutes of one CPU core, seed {seed}.{note}
@@ -375,7 +371,7 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 ## Limits
 
 It has seen drawn ego vehicles only. Thin wipers, and dashboards at night that are as black as the road, are often
-missed. Strong reflections on the glass are not part of the class. Only what reaches the picture's border is kept. Not
+missed. Strong reflections on the glass are not part of the class. Only what reaches the picture's border counts. Not
 for use in a vehicle.
 
 ## Train it again
@@ -391,9 +387,7 @@ def main() -> None:
     arguments = options(__doc__, Path("build/ego"), ego.WEIGHTS, 400, EgoSettings)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    settings = EgoSettings(
-        arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed
-    )
+    settings = EgoSettings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
     store = SegmentStore(arguments.run / "train", settings.frames, TRAIN_SEED, "train", street)
     print(f"{len(store)} frames", flush=True)
     run = EgoRun(settings)

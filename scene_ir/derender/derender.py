@@ -284,7 +284,7 @@ def _find_ego_vehicle(frame: Frame, image: Array) -> Mask | None:
 
 
 def _rows_outside(ego_mask: Mask | None, labels: Labels, rows: list[int]) -> list[int]:
-    """Rows of the labels whose 2D boxes are not mostly the ego vehicle."""
+    """Rows of labels with 2D boxes that are not mostly the ego vehicle."""
     if ego_mask is None:
         return rows
     boxes = labels.boxes_xyxy.clamp(min=0).int().tolist()

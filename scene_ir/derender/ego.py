@@ -26,7 +26,7 @@ WEIGHTS = Path(__file__).parent / "weights" / "ego.safetensors"
 CLASS_NAME = "ego vehicle"
 """Its name among a data set's classes (Cityscapes)."""
 INPUT_HW = (112, 224)
-"""Size of the network's input, whatever the photograph's."""
+"""Size of the network's input, for photographs of any size."""
 DEPTH_M = 0.3
 """Depth of the ego vehicle, m: nearer than all that it hides."""
 _PENALTY = 1.0
