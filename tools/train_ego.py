@@ -45,6 +45,8 @@ DASHCAM_SHARE, DASHCAM_HW = 0.6, (360, 640)
 """Of frames taken by a dashcam and not by one of KITTI's cameras, and the size of its pictures."""
 EGO_SHARE = 0.5
 """Of pictures that show the ego vehicle."""
+RARENESS = -2.5
+"""Log odds of the class before training."""
 TRAIN_SEED, HELD_SEED = 61, 62
 """Of the generator's streams."""
 
@@ -271,7 +273,7 @@ def make_picture(
 class EgoSettings:
     """What decides on the result of a run."""
 
-    steps: int = 1500
+    steps: int = 1000
     batch: int = 8
     frames: int = 300
     """Of the training set."""
@@ -306,6 +308,8 @@ class EgoRun(AveragedRun[EgoNet]):
     def __init__(self, settings: EgoSettings) -> None:
         torch.manual_seed(settings.seed)
         super().__init__(EgoNet().train(), settings)
+        # Without a bias for the class's rareness all features learn to lower it, and none to raise it.
+        torch.nn.init.constant_(self.network.out.bias, RARENESS)  # pyright: ignore[reportArgumentType]
         self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     def step(self, store: SegmentStore) -> float:

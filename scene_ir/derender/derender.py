@@ -138,7 +138,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
 
     # Vehicles and what stands in front of them.
     ego_mask = _find_ego_vehicle(frame, image)
-    rows = _rows_outside(ego_mask, labels, rows)
+    rows = [rows[i] for i in ego.boxes_outside(ego_mask, labels.boxes_xyxy[rows])]
     occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask)
     cuts = _cut_out_vehicles(image, frame, rows, settings, occluder_masks)
     occluder_masks += _find_unlabelled_occluders(frame, cuts, occluder_masks, ground)
@@ -224,7 +224,7 @@ def place_vehicles(frame: Frame, settings: DerenderSettings | None = None) -> di
     labels, rows = _check_frame(frame, settings)
     image = _frame_image(frame)
     ego_mask = _find_ego_vehicle(frame, image)
-    rows = _rows_outside(ego_mask, labels, rows)
+    rows = [rows[i] for i in ego.boxes_outside(ego_mask, labels.boxes_xyxy[rows])]
     occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask)
     return {cut.row: cut.placement for cut in _cut_out_vehicles(image, frame, rows, settings, occluder_masks)}
 
@@ -281,15 +281,6 @@ def _find_ego_vehicle(frame: Frame, image: Array) -> Mask | None:
     numbers = [i for i, name in enumerate(frame.class_names) if name.strip().lower() == ego.CLASS_NAME]
     mask = np.isin(frame.classes.numpy(), numbers)
     return mask if mask.any() else None
-
-
-def _rows_outside(ego_mask: Mask | None, labels: Labels, rows: list[int]) -> list[int]:
-    """Rows of labels with 2D boxes that are not mostly the ego vehicle."""
-    if ego_mask is None:
-        return rows
-    boxes = labels.boxes_xyxy.clamp(min=0).int().tolist()
-    shares = {row: ego_mask[boxes[row][1] : boxes[row][3] + 1, boxes[row][0] : boxes[row][2] + 1] for row in rows}
-    return [row for row in rows if not shares[row].mean() > 0.5]
 
 
 def _find_labelled_occluders(

@@ -93,6 +93,14 @@ def _keep_border_parts(mask: Mask) -> Mask:
     return mask | np.isin(parts, small)
 
 
+def boxes_outside(mask: Mask | None, boxes_xyxy: Tensor) -> list[int]:
+    """Indices of the boxes (N, 4) px of which a mask (H, W) fills at most half; all if there is none."""
+    if mask is None:
+        return list(range(len(boxes_xyxy)))
+    parts = [mask[y0 : y1 + 1, x0 : x1 + 1] for x0, y0, x1, y1 in boxes_xyxy.clamp(min=0).int().tolist()]
+    return [i for i, part in enumerate(parts) if not 2 * np.count_nonzero(part) > part.size]
+
+
 def ignored_regions(mask: Mask) -> Tensor:
     """Boxes (K, 4) px, xyxy, in which no detection counts: for each part of a mask (H, W) its bounding box, cut to the
     rows of which it fills at least half.
