@@ -3,8 +3,8 @@ bonnets, dashboards, wipers and pillars drawn over half of them.
 
     python tools/train_ego.py --run build/ego
 
-A run first generates its frames into its folder, then trains. It resumes where it was stopped, to the
-same bytes as one that was never stopped (one thread, one machine).
+A run first generates its frames into its folder, then trains from the segmenter's weights. It resumes where it was
+stopped, to the same bytes as one that was never stopped (one thread, one machine).
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from train_segmenter import (
 from drivesem.synth.frames import GENERATOR_VERSION, SynthFrame, render_frame
 from scene_ir import files
 from scene_ir.derender import ego
+from scene_ir.derender import segmentation as segment
 from scene_ir.derender.ego import INPUT_HW, EgoNet
 from scene_ir.types import Camera
 
@@ -104,7 +105,7 @@ class EgoPainter:
             sides = np.abs(self.u) ** (2 if corner < 0.75 else 8)
             wave = self.uniform(0, 0.06) * np.cos(self.uniform(4, 14) * self.u + self.uniform(0, 6))
             top = self.height - rise * (1 - curve * sides - tilt * self.u + wave * (self.rng.random() < 0.4))
-            lacquered = self.chance(0.5 if band == 0 else 0.15)
+            lacquered = self.chance(0.6 if band == 0 else 0.15)
             colour = self.bonnet(street, top) if lacquered else self.plastic(top)
             self.blend(colour, np.clip(self.v - top + 0.5, 0, 1))
             if self.chance(0.35):  # a gap or a lit edge
@@ -264,8 +265,8 @@ def make_picture(
     if rng.random() < 0.3:
         draw_glass_reflection(image, rng)
     image = vary_camera(image, rng)
-    if rng.random() < 0.15:  # at night
-        image = image ** rng.uniform(1, 2) * np.float32(rng.uniform(0.15, 0.7))
+    if rng.random() < 0.12:  # at night
+        image = image ** rng.uniform(1, 1.6) * np.float32(rng.uniform(0.25, 0.8))
     return image.astype(np.float32), coverage
 
 
@@ -273,7 +274,7 @@ def make_picture(
 class EgoSettings:
     """What decides on the result of a run."""
 
-    steps: int = 1000
+    steps: int = 1100
     batch: int = 8
     frames: int = 300
     """Of the training set."""
@@ -307,7 +308,10 @@ class EgoRun(AveragedRun[EgoNet]):
 
     def __init__(self, settings: EgoSettings) -> None:
         torch.manual_seed(settings.seed)
-        super().__init__(EgoNet().train(), settings)
+        network = EgoNet().train()
+        known = segment.load_network().state_dict()
+        network.load_state_dict({k: v for k, v in known.items() if not k.startswith("out.")}, strict=False)
+        super().__init__(network, settings)
         # Without a bias for the class's rareness all features learn to lower it, and none to raise it.
         torch.nn.init.constant_(self.network.out.bias, RARENESS)  # pyright: ignore[reportArgumentType]
         self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -354,12 +358,13 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 
 - Architecture: `scene_ir.derender.ego.EgoNet`, {parameters:,} parameters: the segmenter's U-Net on the whole picture at
   {height} x {width} px and each pixel's row. One class: the ego vehicle.
-- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
+- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project.
 - Data: {frames:,} frames of the project's own generator, version {version}, by KITTI's cameras and by dashcams,
-  in all its weathers and seasons; no photographs. Over half of the pictures the ego vehicle is drawn: bands of bonnet, cowl and
-  dashboard of many shapes, wipers, objects on the dashboard, pillars, mirrors. All pictures: other colours, light,
-  shade on the road, unknown objects, faint reflections on the glass, other cameras, noise, compression, darkness.
-- Training: {steps:,} steps of {batch} pictures, {minutes:.0f} minutes of one CPU core, seed {seed}.{note}
+  in all its weathers and seasons; no photographs. Over half of the pictures the ego vehicle is drawn: bands of bonnet,
+  cowl and dashboard of many shapes, wipers, objects on the dashboard, pillars, mirrors. All pictures: other colours,
+  light, shade on the road, unknown objects, faint reflections on the glass, other cameras, noise, compression, darkness.
+- Training: {steps:,} steps of {batch} pictures, {minutes:.0f} minutes of one CPU core, from the segmenter's
+  weights, seed {seed}; nothing else is pretrained.{note}
 
 ## Figures
 
