@@ -362,7 +362,7 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 - Data: {frames:,} frames of the project's own generator, version {version}, by KITTI's cameras and by dashcams,
   in all its weathers and seasons; no photographs. Over half of the pictures the ego vehicle is drawn: bands of bonnet,
   cowl and dashboard of many shapes, wipers, objects on the dashboard, pillars, mirrors. All pictures: other colours,
-  light, shade on the road, unknown objects, faint reflections on the glass, other cameras, noise, compression, darkness.
+  light, shade on the road, unknown objects, faint reflections on the glass, noise, compression, darkness.
 - Training: {steps:,} steps of {batch} pictures, {minutes:.0f} minutes of one CPU core, from the segmenter's
   weights, seed {seed}; nothing else is pretrained.{note}
 
