@@ -368,7 +368,8 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 
 ## Figures
 
-{pictures:,} held-out pictures (streets that no training frame has), as the masks are used:
+{pictures:,} held-out pictures (streets that no training frame has), as the masks are used; the darkest, which count as
+taken by night, have none:
 
 | quantity | value |
 | --- | --- |
@@ -379,8 +380,8 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 
 ## Limits
 
-It has seen drawn ego vehicles only. Thin wipers, and dashboards at night that are as black as the road, are often
-missed. Strong reflections on the glass are not part of the class. Only what reaches the picture's border counts. Not
+It has seen drawn ego vehicles only. It is not used on photographs taken by night, where a dashboard is as black as the
+road. Thin strips, wipers and the glossy front of a bonnet are often missed. Strong reflections on the glass are not part of the class. Only what reaches the picture's border counts. Not
 for use in a vehicle.
 
 ## Train it again

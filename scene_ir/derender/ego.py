@@ -29,14 +29,16 @@ INPUT_HW = (112, 224)
 """Size of the network's input, for photographs of any size."""
 DEPTH_M = 0.3
 """Depth of the ego vehicle, m: nearer than all that it hides."""
-_PENALTY = 1.0
-"""Subtracted from the log odds: half of the training pictures show an ego vehicle, and a false one costs more than a
-missed one."""
+_SURE, _LIKELY = 2.5, -0.3
+"""Log odds that a part must reach in at least the share `_MIN_SHARE` of the photograph, and those that it must have
+everywhere: a false ego vehicle costs more than a missed one, but a found one is wanted whole (hysteresis)."""
+_NIGHT = 0.2
+"""Mean value of photographs taken by night: a dashboard is as black as the road there, and is not searched for."""
 _RADIUS, _FLATNESS = 0.012, 3e-4
 """Guided filter: radius as a share of the photograph's height, and the variance of colour below which a surface is
 uniform."""
 _MIN_SHARE = 0.004
-"""Parts and holes smaller than this share of the photograph are noise."""
+"""Parts and holes below this share of the photograph are noise."""
 
 
 class EgoNet(UNet):
@@ -67,27 +69,34 @@ def find_ego_vehicle(image: Array, network: EgoNet | None = None) -> Mask | None
         network: In place of the shipped one.
 
     Returns:
-        Its pixels (H, W); None if the photograph does not show it.
+        Its pixels (H, W); None if the photograph does not show it, or was taken by night.
     """
     height, width = image.shape[:2]
     small = np.asarray(cv2.resize(image, INPUT_HW[::-1], interpolation=cv2.INTER_AREA), np.float32)
-    view = NetworkInput(small, row_map(1)[0, 0].numpy())
-    share = (network or load_network()).predict(view)[0, 0].sub(_PENALTY).sigmoid().numpy()
-    if share.max() < 0.5:
+    if small.mean() < _NIGHT:
         return None
-    large = cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR)
-    soft = cv2.ximgproc.guidedFilter(image * 255, large, max(2, round(_RADIUS * height)), _FLATNESS * 255**2)
-    mask = _keep_border_parts(soft > 0.5)
+    view = NetworkInput(small, row_map(1)[0, 0].numpy())
+    odds = (network or load_network()).predict(view)[0, 0]
+    if float(odds.max()) < _SURE:
+        return None
+    likely, sure = (
+        cv2.resize((odds - level).sigmoid().numpy(), (width, height), interpolation=cv2.INTER_LINEAR)
+        for level in (_LIKELY, _SURE)
+    )
+    soft = cv2.ximgproc.guidedFilter(image * 255, likely, max(2, round(_RADIUS * height)), _FLATNESS * 255**2)
+    mask = _keep_border_parts(soft > 0.5, sure > 0.5)
     return mask if mask.any() else None
 
 
-def _keep_border_parts(mask: Mask) -> Mask:
-    """The connected parts of a mask (H, W) that reach the picture's border, without small ones and small holes."""
+def _keep_border_parts(mask: Mask, sure: Mask) -> Mask:
+    """The connected parts of a mask (H, W) that reach the picture's border and have enough `sure` pixels (H, W), without
+    small holes.
+    """
     least_px = _MIN_SHARE * mask.size
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     border = np.unique(np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]]))
-    large = [k for k in range(1, count) if k in border and stats[k, cv2.CC_STAT_AREA] >= least_px]
-    mask = np.isin(parts, large)
+    sure_px = np.bincount(parts[sure], minlength=count)
+    mask = np.isin(parts, [k for k in border if k and sure_px[k] >= least_px])
     count, parts, stats, _ = cv2.connectedComponentsWithStats((~mask).astype(np.uint8), connectivity=4)
     small = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] < least_px]
     return mask | np.isin(parts, small)

@@ -132,11 +132,13 @@ def test_it_survives_saving(scene, tmp_path):
     assert torch.equal(lossy == 1, scene.environment.ego > 1 - 0.5 / 31)
 
 
-def test_parts_that_reach_no_border_and_specks_are_dropped():
+def test_parts_that_reach_no_border_specks_and_unsure_parts_are_dropped():
     mask = np.zeros((100, 200), bool)
-    mask[80:], mask[:3, :5], mask[30:50, 60:90] = True, True, True
+    mask[80:], mask[:3, :5], mask[30:50, 60:90], mask[:60, 180:] = True, True, True, True
     mask[90:93, 100:104] = False
-    kept = ego._keep_border_parts(mask)
+    sure = mask.copy()
+    sure[:, 175:] = False
+    kept = ego._keep_border_parts(mask, sure)
     assert kept[80:].all()
     assert not kept[:80].any()
 
