@@ -381,8 +381,9 @@ taken by night, have none:
 ## Limits
 
 It has seen drawn ego vehicles only. It is not used on photographs taken by night, where a dashboard is as black as the
-road. Thin strips, wipers and the glossy front of a bonnet are often missed. Strong reflections on the glass are not part of the class. Only what reaches the picture's border counts. Not
-for use in a vehicle.
+road. Thin strips, wipers and the glossy front of a bonnet are often missed; dark or wet road next to a dashboard is
+sometimes taken for it. Strong reflections on the glass are not part of the class. Only what reaches the picture's
+border counts. Not for use in a vehicle.
 
 ## Train it again
 

@@ -89,8 +89,8 @@ def find_ego_vehicle(image: Array, network: EgoNet | None = None) -> Mask | None
 
 
 def _keep_border_parts(mask: Mask, sure: Mask) -> Mask:
-    """The connected parts of a mask (H, W) that reach the picture's border and have enough `sure` pixels (H, W), without
-    small holes.
+    """The connected parts of a mask (H, W) at the picture's border that have enough `sure` pixels (H, W), without small
+    holes.
     """
     least_px = _MIN_SHARE * mask.size
     count, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
