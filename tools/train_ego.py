@@ -359,6 +359,7 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 - Architecture: `scene_ir.derender.ego.EgoNet`, {parameters:,} parameters: the segmenter's U-Net on the whole picture at
   {height} x {width} px and each pixel's row. One class: the ego vehicle.
 - Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project.
+  SHA-256: `{sha256}`
 - Data: {frames:,} frames of the project's own generator, version {version}, by KITTI's cameras and by dashcams,
   in all its weathers and seasons; no photographs. Over half of the pictures the ego vehicle is drawn: bands of bonnet,
   cowl and dashboard of many shapes, wipers, objects on the dashboard, pillars, mirrors. All pictures: other colours,
@@ -416,6 +417,7 @@ def main() -> None:
         height=height,
         width=width,
         file=arguments.out.name,
+        sha256=files.sha256_digest(arguments.out),
         frames=len(store),
         version=GENERATOR_VERSION,
         steps=settings.steps,

@@ -29,7 +29,7 @@ INPUT_HW = (112, 224)
 """Size of the network's input, for photographs of any size."""
 DEPTH_M = 0.3
 """Depth of the ego vehicle, m: nearer than all that it hides."""
-_SURE, _LIKELY = 2.5, -0.3
+_SURE, _LIKELY = 2.5, 0.3
 """Log odds that a part must reach in at least the share `_MIN_SHARE` of the photograph, and those that it must have
 everywhere: a false ego vehicle costs more than a missed one, but a found one is wanted whole (hysteresis)."""
 _NIGHT = 0.2
