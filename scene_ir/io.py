@@ -120,6 +120,8 @@ def save_scene(scene: SceneIR, folder: Path, lossy: bool = False) -> None:
         arrays |= {name: _array(getattr(scene.environment, name)) for name in _MAPS}
         if scene.environment.closed_sky is not None:
             arrays[_CLOSED_SKY] = _array(scene.environment.closed_sky)
+        if scene.environment.ego is not None:
+            arrays["ego"] = _array(scene.environment.ego)
         in_png = {}
         for name in _IMAGES:
             image = getattr(scene, name).detach().cpu()
@@ -206,6 +208,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             },
             **{name: arrays.tensor(name, *size) for name in _MAPS},
             closed_sky=arrays.tensor(_CLOSED_SKY, 3, None, None) if _CLOSED_SKY in arrays else None,
+            ego=arrays.tensor("ego", *size) if "ego" in arrays else None,
         )
     )
     meshes = tuple(_load_mesh(folder / "meshes" / f"{i}.glb") for i in range(root["meshes"].integer()))

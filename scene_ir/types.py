@@ -328,6 +328,9 @@ class Environment:
     closed_sky: Tensor | None = None
     """(3, h, w) in [0, 1], the background under a closed sky as codes of its ratio to the photographed one:
     exp((2 code - 1) `render.model.CLOSED_SKY_LOG`); None for what is not known."""
+    ego: Tensor | None = None
+    """(H, W) in [0, 1], opacity of the ego vehicle (bonnet, dashboard), which no code changes; None if the photograph
+    does not show it."""
 
     def __post_init__(self) -> None:
         if isinstance(self.weather, Tensor) and self.weather.shape in [(n,) for n in PAST_WEATHER_DIMS]:
@@ -343,6 +346,8 @@ class Environment:
         check_shape("environment.road", self.road, *self.sky.shape)
         if self.closed_sky is not None:
             check_shape("environment.closed_sky", self.closed_sky, 3, None, None)
+        if self.ego is not None:
+            check_shape("environment.ego", self.ego, *self.sky.shape)
         for name in ("weather", "foliage", "light", "sun", "ground"):
             check_finite(f"environment.{name}", getattr(self, name))
 

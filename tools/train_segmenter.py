@@ -12,7 +12,7 @@ import argparse
 import csv
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -116,7 +116,15 @@ class SegmentStore:
     images (N, h, w, 3) uint8, classes (N, h, w) uint8, elevation (N, h, w) float16: see `unet.elevation`.
     """
 
-    def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        frames: int,
+        seed: int,
+        split: str,
+        make: Callable[[int, int, str], SynthFrame] | None = None,
+    ) -> None:
+        """make: the frame of a seed, an index and a split; by default `street`."""
         folder.mkdir(parents=True, exist_ok=True)
         stamp = folder / "frames.json"
         wanted = {"seed": seed, "split": split}
@@ -125,7 +133,7 @@ class SegmentStore:
             raise ValueError(f"{stamp}: expected frames of {wanted}, found {found}")
         height, width = STORE_HW
         for index in range(found["frames"], frames):
-            frame = street(seed, index, split)
+            frame = (make or street)(seed, index, split)
             image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
             height_of = unet.compute_elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
             files.write_npz(

@@ -23,6 +23,7 @@ from drivesem.attacks.targets import resolve_t_star
 from drivesem.data.classes import VEHICLES, rename_to_types
 from drivesem.data.ground_truth import occlusion_from_visible
 from drivesem.data.label_table import UNKNOWN_OCCLUSION
+from scene_ir.derender import ego
 from scene_ir.derender.derender import DerenderSettings
 from scene_ir.derender.pose import BORDER_PX, VehiclePoses, back_project, estimate_poses
 from scene_ir.derender.silhouette import FitSettings
@@ -125,7 +126,7 @@ def label_from_detections(
     Poses come from `scene_ir.derender.pose`; vehicles' boxes are the projections of their poses. Occlusion is
     estimated from nearer boxes, so it is an upper bound; truncation from the image's border. Other objects than
     cars, trucks, pedestrians and cyclists are dropped, and so are vehicles off the ground or in the place of one
-    with a higher score.
+    with a higher score, and boxes of which the ego vehicle fills more than half.
 
     Args:
         frame: Photograph and camera.
@@ -140,10 +141,13 @@ def label_from_detections(
         RangeError: A label beyond `classes`, or a box without area.
     """
     names = [_class_name(int(label), classes) for label in detections.labels]
-    boxes = detections.boxes_xyxy.float()
+    image = np.ascontiguousarray(frame.photograph.detach().cpu().float().numpy().transpose(1, 2, 0))
+    outside = ego.boxes_outside(ego.find_ego_vehicle(image), detections.boxes_xyxy)
+    names, scores = [names[i] for i in outside], detections.scores[outside]
+    boxes = detections.boxes_xyxy[outside].float()
     is_vehicle = torch.tensor([name in VEHICLES for name in names], dtype=torch.bool)
     boxes = torch.where(is_vehicle[:, None], _snap_to_border(boxes, frame.camera), boxes)
-    placed = _place_objects(frame, boxes, names, detections.scores, ground, POSE_ROUNDS)
+    placed = _place_objects(frame, boxes, names, scores, ground, POSE_ROUNDS)
     vehicles, poses = placed.vehicles, placed.poses
     boxes = boxes.clone()
     boxes[vehicles] = placed.inside[vehicles]
@@ -164,7 +168,7 @@ def label_from_detections(
     )
     for n, i in enumerate(selected):
         if i in row:
-            provenance[f"labels[{n}].score"] = f"{float(detections.scores[i]):.3f}"
+            provenance[f"labels[{n}].score"] = f"{float(scores[i]):.3f}"
     return replace(frame, labels=labels, provenance={**frame.provenance, **provenance})
 
 

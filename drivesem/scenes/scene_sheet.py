@@ -35,7 +35,7 @@ PANEL_PX = 640
 _COLUMNS = 3
 GAIN = 8
 """Factor of the difference."""
-MAPS = {"sky": (70, 150, 235), "foliage_map": (60, 180, 75), "road": (225, 90, 160)}
+MAPS = {"sky": (70, 150, 235), "foliage_map": (60, 180, 75), "road": (225, 90, 160), "ego": (245, 190, 40)}
 """Colours of the environment's maps."""
 _NUMBER_INK = (255, 255, 255)
 
@@ -207,8 +207,10 @@ def _draw_maps(scene: SceneIR) -> np.ndarray:
         .astype(np.float32)
     )
     for name, colour in MAPS.items():
-        share = 0.65 * getattr(scene.environment, name).detach().cpu().float().numpy()[..., None]
-        canvas += share * (np.array(colour, np.float32) - canvas)
+        share = getattr(scene.environment, name)
+        if share is not None:
+            opacity = 0.65 * share.detach().cpu().float().numpy()[..., None]
+            canvas += opacity * (np.array(colour, np.float32) - canvas)
     return canvas.round().clip(0, 255).astype(np.uint8)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scene_ir.derender import alignment as icp
 from scene_ir.derender import alignment as template_choice
-from scene_ir.derender import cutout, delight, depth, occluders, paint_mask, segmentation, shadow, silhouette
+from scene_ir.derender import cutout, delight, depth, ego, occluders, paint_mask, segmentation, shadow, silhouette
 from scene_ir.derender import depth as ground_geometry
 from scene_ir.derender import matte as mask_extension
 from scene_ir.derender.background_fill import BackgroundFill, BackgroundInputs
@@ -137,24 +137,27 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     ground = ground_geometry.fit_ground(labels, _posed_rows(labels))
 
     # Vehicles and what stands in front of them.
-    occluder_masks = _find_labelled_occluders(frame, image, rows)
+    ego_mask = _find_ego_vehicle(frame, image)
+    rows = [rows[i] for i in ego.boxes_outside(ego_mask, labels.boxes_xyxy[rows])]
+    occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask)
     cuts = _cut_out_vehicles(image, frame, rows, settings, occluder_masks)
     occluder_masks += _find_unlabelled_occluders(frame, cuts, occluder_masks, ground)
     occluder_masks.sort(key=lambda occluder: occluder.depth_m)
     cuts = _remove_occluders(cuts, occluder_masks, camera)
     opacities = occluders.compute_opacities(image, occluder_masks)
+    ego_opacity = opacities[0] if ego_mask is not None else np.zeros(image.shape[:2], np.float32)
     views = [shadow.view_ground(cut.placement, ground, camera) for cut in cuts]
     cuts = [_remove_underbody(cut, view) for cut, view in zip(cuts, views, strict=True)]
     vehicles = _union([grow_mask(cut.mask, 2) for cut in cuts], image.shape[:2])
 
     # Background, mattes and shadows.
     maps = segmentation.segment_photograph(image, ground, camera, settings.segmenter)
-    maps = segmentation.apply_frame_classes(frame, maps)
+    maps = segmentation.apply_frame_classes(frame, maps).outside(ego_opacity)
     inputs = BackgroundInputs(
         ground_geometry.horizon_row(ground, camera),
         ground,
         camera,
-        _non_vehicle_boxes(labels, camera),
+        _non_vehicle_boxes(labels, camera) | (ego_opacity > 0),
         sum(opacities, np.zeros(image.shape[:2], np.float32)),
         maps,
     )
@@ -165,7 +168,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         # The frame's classes do not cover what stands behind the vehicles.
         behind = segmentation.segment_photograph(background, ground, camera, settings.segmenter, settings.shrink)
         filled = channel_max(np.abs(background - image)) > 0
-        maps = segmentation.apply_frame_classes(frame, behind).merge_inside(filled, behind)
+        maps = segmentation.apply_frame_classes(frame, behind).merge_inside(filled, behind).outside(ego_opacity)
     footprints = ground_geometry.draw_footprints(labels, _posed_rows(labels), ground, camera)
     constraints = depth.DepthConstraints(maps.sky, maps.ground, footprints, _min_background_depth(cuts, camera))
     depth_m = torch.from_numpy(depth.estimate_depth(background, ground, camera, constraints))
@@ -183,11 +186,16 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     # People, trams and vehicles that were not cut out stay in the background, and no detection counts there.
     object_rows = {cut.row for cut in cuts}
     other_labels = labels.select([row for row in range(len(labels.kind)) if row not in object_rows])
+    if ego_mask is not None:
+        regions = torch.cat([other_labels.ignore_xyxy, ego.ignored_regions(ego_mask).to(other_labels.ignore_xyxy)])
+        other_labels = replace(other_labels, ignore_xyxy=regions)
     scene = SceneIR(
         camera,
         meshes,
         objects,
-        _make_environment(maps, ground, sun, vehicles, delight.estimate_closed_sky(background, ground, camera)),
+        _make_environment(
+            maps, ground, sun, vehicles, delight.estimate_closed_sky(background, ground, camera), ego_opacity
+        ),
         frame.photograph.float(),
         torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1))),
         depth_m,
@@ -215,9 +223,11 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
 def place_vehicles(frame: Frame, settings: DerenderSettings | None = None) -> dict[int, Placement]:
     """Fitted placements of a photograph's vehicles, by row of their labels: the geometric part of `derender`."""
     settings = settings or DerenderSettings()
-    _, rows = _check_frame(frame, settings)
+    labels, rows = _check_frame(frame, settings)
     image = _frame_image(frame)
-    occluder_masks = _find_labelled_occluders(frame, image, rows)
+    ego_mask = _find_ego_vehicle(frame, image)
+    rows = [rows[i] for i in ego.boxes_outside(ego_mask, labels.boxes_xyxy[rows])]
+    occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask)
     return {cut.row: cut.placement for cut in _cut_out_vehicles(image, frame, rows, settings, occluder_masks)}
 
 
@@ -266,12 +276,27 @@ def _to_uint8(image: Array) -> NDArray[np.uint8]:
     return np.clip(np.rint(image * 255), 0, 255).astype(np.uint8)
 
 
-def _find_labelled_occluders(frame: Frame, image: Array, rows: list[int]) -> list[OccluderMask]:
-    """People and the like in front of vehicles, by their labels."""
+def _find_ego_vehicle(frame: Frame, image: Array) -> Mask | None:
+    """Pixels (H, W) of the ego vehicle, by the frame's classes or the network; None if there are none."""
+    if frame.classes is None:
+        return ego.find_ego_vehicle(image)
+    numbers = [i for i, name in enumerate(frame.class_names) if name.strip().lower() == ego.CLASS_NAME]
+    mask = np.isin(frame.classes.numpy(), numbers)
+    return mask if mask.any() else None
+
+
+def _find_labelled_occluders(
+    frame: Frame, image: Array, rows: list[int], ego_mask: Mask | None
+) -> list[OccluderMask]:
+    """The ego vehicle, if it is visible, then people and the like in front of vehicles, by their labels."""
     labels = frame.labels
     assert labels is not None
     others = [row for row in _posed_rows(labels) if labels.kind[row] not in VEHICLE_CATEGORIES]
-    return occluders.find_labelled_occluders(_to_uint8(image), frame, rows, others)
+    labelled = occluders.find_labelled_occluders(_to_uint8(image), frame, rows, others)
+    if ego_mask is None:
+        return labelled
+    rest = [replace(occluder, mask=occluder.mask & ~ego_mask) for occluder in labelled]
+    return [OccluderMask(ego_mask, ego.DEPTH_M), *(occluder for occluder in rest if occluder.mask.any())]
 
 
 def _find_unlabelled_occluders(
@@ -664,6 +689,7 @@ def _make_environment(
     sun: torch.Tensor,
     vehicles: Mask,
     closed_sky: torch.Tensor,
+    ego_opacity: Array,
 ) -> Environment:
     """The background's maps, with codes 0."""
     # Weather changes the finished picture, so a vehicle in front of the sky is not sky. Foliage changes before the
@@ -676,6 +702,7 @@ def _make_environment(
         ground,
         *(torch.from_numpy(np.ascontiguousarray(m, dtype=np.float32)) for m in (sky, maps.foliage, maps.road)),
         closed_sky=closed_sky,
+        ego=torch.from_numpy(ego_opacity) if ego_opacity.any() else None,
     )
 
 

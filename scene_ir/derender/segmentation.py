@@ -70,6 +70,10 @@ class Segmentation:
             *(np.where(mask, getattr(other, f.name), getattr(self, f.name)) for f in fields(Segmentation))
         )
 
+    def outside(self, opacity: Array) -> Segmentation:
+        """These maps without what is in front, of an opacity (H, W)."""
+        return Segmentation(*(getattr(self, f.name) * (1 - opacity) for f in fields(Segmentation)))
+
 
 Segmenter = Callable[[Array], tuple[Array, tuple[str, ...]]]
 """A photograph (H, W, 3) RGB in [0, 1] -> shares (C, h, w) in [0, 1] of any size, and the names of the C

@@ -164,6 +164,10 @@ class Compositor(PreparedScene):
             image = apply_night(image, inverse[0], changed, lit, lamps, self.night_maps, backend)
         if weather or layers is None:
             image = blend.clamp_colour(image[:3])
+        if self.scene.environment.ego is not None:  # at 1, `lerp` takes the photograph to the bit
+            ego = self.scene.environment.ego.to(self.like)
+            image = torch.lerp(image, self.scene.photograph, ego)
+            number = number.masked_fill(ego > 0.5, 0)
         return Render(image, depth, number, opacity, drawn)
 
 

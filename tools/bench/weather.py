@@ -62,7 +62,9 @@ _SUN_CORNERS = ((1, 1, 1), (1, -1, 1), (-1, 1, -1), (-1, -1, -1))
 CODES: dict[str, FrameEdit] = {
     "none": FrameEdit(),
     **{
-        f"{WEATHER_CODES[code]} {amount:g}": FrameEdit(weather=tuple(amount * (other == code) for other in Weather))
+        f"{WEATHER_CODES[code]} {amount:g}": FrameEdit(
+            weather=tuple(amount * (other == code) for other in Weather)
+        )
         for code in DRAWN_WEATHER
         for amount in (0.5, 1.0)
     },

@@ -70,6 +70,17 @@ def test_detections_become_labels() -> None:
     assert float(labels.translation[2, 2]) == pytest.approx(720 * 1.75 / 110, rel=0.6)
 
 
+def test_boxes_on_the_ego_vehicle_become_no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    bonnet = np.zeros((375, 1242), bool)
+    bonnet[300:] = True
+    monkeypatch.setattr("scene_ir.derender.ego.find_ego_vehicle", lambda _: bonnet)
+    boxes = [[550.0, 170, 650, 240], [400, 280, 700, 374], [0, 170, 120, 320]]
+    found = label_from_detections(frame_of(), seen(boxes, [CAR, CAR, TRUCK]))
+    assert found.labels is not None
+    assert found.labels.kind == ("Car", "Truck")
+    assert found.labels.boxes_xyxy[0].tolist() == pytest.approx(boxes[0], abs=25)
+
+
 def known(places: torch.Tensor) -> Callable[..., pose.VehiclePoses]:
     """An estimate that puts cars, all heading away, at these places on a level road."""
     count = len(places)

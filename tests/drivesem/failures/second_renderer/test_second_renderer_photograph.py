@@ -190,3 +190,12 @@ def test_other_vehicles_than_the_photographs_are_refused(second: PhotographRende
         other = demo_scene(0, 2)
     with pytest.raises(RangeError, match="demo-000"):
         second.render(other)
+
+
+def test_weather_stops_at_the_ego_vehicle(second: PhotographRenderer, scene: SceneIR) -> None:
+    bonnet = torch.zeros_like(scene.depth)
+    bonnet[-40:] = 1.0
+    rainy = scene.with_environment(weather=torch.tensor([0.5, 1.0, 0, 0]))
+    drawn = second.render(rainy.with_environment(ego=bonnet)).image
+    assert torch.equal(drawn[:, -40:], (scene.photograph[:, -40:] * 255).round() / 255)
+    assert torch.equal(drawn[:, :-40], second.render(rainy).image[:, :-40])
