@@ -96,12 +96,12 @@ class Compositor(PreparedScene):
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))
             canvas = torch.cat([apply_foliage(canvas[:3], changed, self.crown_maps, backend), canvas[3:]])
-        covered = weather and self.closed_sky_gain is not None
-        if covered:
+        closed_sky = self.closed_sky_gain if weather else None
+        if closed_sky is not None:
             hidden = 1.0 - sunlight_share(environment.weather.to(self.like))
-            canvas = torch.cat([canvas[:3] * (1.0 + hidden * self.closed_sky_gain), canvas[3:]])
+            canvas = torch.cat([canvas[:3] * (1.0 + hidden * closed_sky), canvas[3:]])
         if self.occluders is not None:
-            changed = foliage or covered
+            changed = foliage or closed_sky is not None
             layers = self.occluders.append_to(layers, canvas[:3] - self.canvas[:3] if changed else None)
         drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)
         behind = self.scene.environment
