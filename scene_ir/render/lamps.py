@@ -42,6 +42,8 @@ class VehicleLamps:
     """(N, 4, 2) from there to the photograph's own lamps, right and down."""
     driven: Tensor
     """(N,) in [0, 1]: 0 is parked, with all lamps off."""
+    front: Tensor
+    """(N, 4) bool, which are headlamps."""
 
 
 def lamps_on(weather: Tensor) -> Tensor:
@@ -63,15 +65,22 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     unit = torch.stack([find_lamp_places(mesh) for mesh in meshes]).to(like)
     weights = ffd.lattice_weights(unit.reshape(-1, 3)).reshape(*unit.shape[:2], -1)
     driven = torch.stack([is_driven(scene, base, i) for i in range(len(base))]).to(like)
-    still = VehicleLamps(unit, weights, torch.zeros_like(unit[..., :2]), driven)
+    front = torch.tensor([x > 0 for x, _ in _QUADRANTS]).repeat(len(base), 1)
+    still = VehicleLamps(unit, weights, torch.zeros_like(unit[..., :2]), driven, front)
     xy, depth, facing = project_lamps(still, scene, base, centre)
     focal = scene.camera.matrix[0, 0].to(like)
     reach_px = model.LAMP_SEARCH * focal * base.size_lhw[:, 2:].to(like) / depth
     shift_px = torch.zeros_like(xy)
-    for i, k in ((facing > 0.2) & (depth > 0.5)).nonzero().tolist() if base.source else ():
-        reach = max(float(reach_px[i, k]), _LEAST_SEARCH_PX)
-        shift_px[i, k] = _snap(base.source[i].foreground, xy[i, k], reach, k < 2)
-    return VehicleLamps(unit, weights, shift_px * (depth / focal)[..., None], driven)
+    seen = (facing > 0.2) & (depth > 0.5)
+    for i in range(len(base)) if base.source else ():
+        foreground = base.source[i].foreground
+        reach = reach_px[i].clamp(min=_LEAST_SEARCH_PX).tolist()
+        ahead = [k for k in (0, 1) if seen[i, k]]
+        if ahead and _are_red(foreground, xy[i, ahead], reach[ahead[0]]):
+            front[i] = ~front[i]  # the estimated heading is turned by 180 degrees
+        for k in seen[i].nonzero()[:, 0].tolist():
+            shift_px[i, k] = _snap(foreground, xy[i, k], reach[k], bool(front[i, k]))
+    return VehicleLamps(unit, weights, shift_px * (depth / focal)[..., None], driven, front.to(like.device))
 
 
 def find_lamp_places(mesh: Mesh) -> Tensor:
@@ -108,6 +117,20 @@ def is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
         return torch.tensor(1.0)
     road = scene.environment.road.cpu()[rows[inside], columns[inside]].double().mean()
     return smoothstep(road, *model.DRIVEN_ROAD)
+
+
+def _are_red(foreground: Crop, places: Tensor, reach_px: float) -> bool:
+    """Whether the photograph is red around the places (K, 2) px of lamps, and much less so elsewhere on the vehicle."""
+    red, green, blue, opacity = foreground.values.to(places)
+    redness = smoothstep(red - torch.maximum(green, blue), *model.TAIL_LAMP_RED) * opacity
+    height, width = redness.shape
+    shares = []
+    for x, y in (places - places.new_tensor([foreground.x0, foreground.y0])).tolist():
+        rows = slice(min(max(round(y - reach_px), 0), height - 1), max(round(y + reach_px) + 1, 1))
+        columns = slice(min(max(round(x - reach_px), 0), width - 1), max(round(x + reach_px) + 1, 1))
+        shares.append(float(redness[rows, columns].mean()))
+    there = max(shares)
+    return there > model.RED_LAMPS[0] and there > model.RED_LAMPS[1] * float(redness.mean())
 
 
 def _snap(foreground: Crop, xy: Tensor, reach_px: float, front: bool) -> Tensor:
@@ -179,7 +202,7 @@ def draw_lamps(
         return centre.new_zeros(3, height, width)
     xy, mirror_xy = (places.reshape(-1, 2)[index] for places in (xy, mirror_xy))
     depth, facing, seen = (values.reshape(-1)[index] for values in (depth, facing, seen))
-    front = index % 4 < 2
+    front = lamps.front.reshape(-1)[index]
     longer = -torch.expm1(-(weather.new_tensor(model.LAMP_EXPOSURE) * weather).sum())
     exposure = model.LAMP_BY_DAY + (1.0 - model.LAMP_BY_DAY) * longer
     extinction = (

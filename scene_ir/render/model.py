@@ -341,5 +341,7 @@ LAMP_SEARCH = 0.14
 """Reach of the search for the photograph's own lamp, in widths of the vehicle."""
 TAIL_LAMP_RED, HEADLAMP_WHITE = (0.12, 0.25), (0.70, 0.85)
 """Excess of red, and least channel, from which a pixel may be, and is, a tail lamp or a headlamp."""
+RED_LAMPS = (0.06, 2.5)
+"""Share of red around lamps from which they are tail lamps, and how much more that is than on the whole vehicle."""
 DRIVEN_ROAD = (0.35, 0.75)
 """Share of road beyond a vehicle's outer side from which it may drive, and does."""

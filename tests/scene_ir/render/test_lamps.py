@@ -10,7 +10,7 @@ from scene_ir.meshes.templates import KINDS, template
 from scene_ir.render import lamps, model
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import WEATHER_DIM, SceneIR, Weather
+from scene_ir.types import WEATHER_DIM, Crop, SceneIR, Weather
 
 ONCOMING, AHEAD = 0, 1
 """Rows of a car that faces the camera and of one that faces away."""
@@ -203,3 +203,27 @@ def test_both_backends_draw_them_alike(photographed: SceneIR) -> None:
     compositor.lamps = replace(compositor.lamps, driven=torch.zeros_like(compositor.lamps.driven))
     assert float((compositor.render(dark).image - pictures[0]).abs().amax()) > 10 * 2e-3
     assert model.LAMPS_ON[Weather.NIGHT] > 0
+
+
+def _rear(paint: tuple[float, float, float], lamp: tuple[float, float, float]) -> Crop:
+    """A vehicle of 40 x 60 px at (100, 50) with lamps at its left and right."""
+    values = torch.tensor([*paint, 1.0])[:, None, None].repeat(1, 40, 60)
+    for x in (6, 54):
+        values[:3, 16:22, x - 3 : x + 3] = torch.tensor(lamp)[:, None, None]
+    return Crop(values, 100, 50)
+
+
+@pytest.mark.parametrize(
+    ("paint", "lamp", "rear"),
+    [
+        ((0.4, 0.4, 0.45), (0.8, 0.1, 0.1), True),
+        ((0.4, 0.4, 0.45), (0.9, 0.9, 0.9), False),
+        ((0.7, 0.1, 0.1), (0.9, 0.9, 0.9), False),
+        ((0.7, 0.1, 0.1), (0.8, 0.1, 0.1), False),
+    ],
+)
+def test_red_lamps_of_a_vehicle_of_another_colour_are_tail_lamps(
+    paint: tuple[float, float, float], lamp: tuple[float, float, float], rear: bool
+) -> None:
+    places = torch.tensor([[106.0, 69.0], [154.0, 69.0]])
+    assert lamps._are_red(_rear(paint, lamp), places, 8.0) is rear
