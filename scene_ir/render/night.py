@@ -82,12 +82,15 @@ def compute_night_maps(scene: SceneIR, background: Tensor) -> NightMaps:
     fixed = torch.from_numpy(np.stack([*planes])).to(like)
     glare = glare + lamps + ((1 - sky) * missed * glow)[..., None] * np.array(model.GLOW_RGB)
     glare, shining = (
-        torch.from_numpy(np.ascontiguousarray(np.moveaxis(light, 2, 0))).to(like) for light in (glare, shining)
+        torch.from_numpy(np.ascontiguousarray(np.moveaxis(light, 2, 0))).to(like.dtype) for light in (glare, shining)
     )
-    mirrored = mirror_in_ground(shining, 1.0 / scene.depth, scene.environment.road, rise, camera_m)
-    wet = model.LIT_MIRROR * mirror_share(scene.depth, camera_m).to(like) * mirrored
+    far, flat = scene.depth.cpu(), scene.environment.road.cpu()
+    mirrored = mirror_in_ground(shining, 1.0 / far, flat, rise, camera_m)
+    wet = model.LIT_MIRROR * mirror_share(far, camera_m).to(like.dtype) * mirrored
     return NightMaps(
-        torch.cat([fixed, _noise_field(height, width).to(like), glare, wet]), camera_m, measure_daylight(scene)
+        torch.cat([fixed, _noise_field(height, width).to(like), glare.to(like), wet.to(like)]),
+        camera_m,
+        measure_daylight(scene),
     )
 
 

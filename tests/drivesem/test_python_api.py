@@ -166,14 +166,14 @@ def test_a_scene_says_what_is_changed(scene: ds.Scene) -> None:
     assert changed.theta == pytest.approx(
         {
             "weather.fog": 0.6,
-            "weather.overcast": 0.4,
+            "weather.overcast": 0.8,
             "objects[1].translate.across": 0.5 / scene.rows()[1]["length_m"],
             "objects[0].yaw": math.radians(10),
         },
         abs=1e-5,
     )
     assert changed.weather == pytest.approx(
-        {"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.4, "night": 0, "snow": 0}
+        {"fog": 0.6, "rain": 0, "time": 0, "overcast": 0.8, "night": 0, "snow": 0}
     )
     by_night = scene.edit("objects[1].lamps=off", weather="fog=0.6,night=1")
     assert by_night.theta == pytest.approx({"weather.fog": 0.6, "weather.night": 1.0, "objects[1].lamps": -1.0})

@@ -76,7 +76,7 @@ def test_judged_against_the_street_under_clouds(pair: Any) -> None:
     assert set(metrics) == {"sun", "clouds"}
     before, after = metrics["sun"]
     assert before == pytest.approx(
-        after, abs=0.1
+        after, abs=0.2
     )  # a network without an opinion changes no pixel by more than a code
     assert metrics["clouds"][0] == 80  # the picture itself
     assert training.format_table(metrics).count("\n") == 1 + len(metrics)

@@ -355,7 +355,7 @@ def test_infeasible_positions_are_reported_and_rendered(demo: Path, tmp_path: Pa
         (["--set", "objects[99].rotate=1deg"], "objects[99]: expected a row from 0 to"),
         (["--set", "objects[0].rotate=1"], "expected a unit: 1deg or 1rad"),
         (["--set", "objects[0].wheels=1"], "wheels"),
-        (["--set", "weather=snow"], "snow"),
+        (["--set", "weather=hail"], "hail"),
         (["--set", "objects[0].mesh=50%"], "shares need a scene with changed shapes, and --photographed"),
         (["--remove", "99"], "objects[99]: expected a row from 0 to"),
         (["--remove", "red"], "--remove: expected numbers from 0, or all, found 'red'"),

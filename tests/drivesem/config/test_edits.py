@@ -64,7 +64,7 @@ def test_settings_of_the_scene() -> None:
         weather=(0.0, 0.4, 0.0, 0.0, 0.0, 0.0), foliage=(-0.5, 0.0, 0.0)
     )
     assert edit_of("weather=fog=0.6,night=1").weather == (0.6, 0.0, 0.0, 0.0, 1.0, 0.0)
-    assert edit_of("weather=snow").weather == (0.0, 0.0, 0.0, 0.0, 0.0, 0.8)
+    assert edit_of("weather=snow").weather == (0.0, 0.0, 0.0, 0.0, 0.0, 0.6)
     assert edit_of("weather.rain=0.4", "weather=fog=0.6").weather == (0.6, 0.0, 0.0, 0.0, 0.0, 0.0)
     for name, codes in WEATHER_PRESETS.items():
         assert edit_of(f"weather={name}").weather == tuple(codes.get(code, 0.0) for code in WEATHER_CODES)

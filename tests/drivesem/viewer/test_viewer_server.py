@@ -130,7 +130,7 @@ def test_a_state_as_picture_and_as_what_is_found(server: Server, viewer: Viewer)
         ("/picture?frame=still&weather.fog=nan", 400, "weather.fog: expected a number, found nan"),
         ("/picture?frame=still&weather.fog=inf", 400, "expected a number"),
         ("/picture?frame=still&weather.fog=1.5", 400, "weather.fog: expected 0 to 1, found 1.5"),
-        ("/picture?frame=still&weather.snow=1", 400, "weather.snow: expected a parameter of this scene"),
+        ("/picture?frame=still&weather.hail=1", 400, "weather.hail: expected a parameter of this scene"),
         ("/picture?frame=still&objects[0].yaw=170", 400, "expected -20 to 20 deg, found 170"),
         ("/picture?frame=still&n=-1", 400, "n: expected a whole number from 0, found -1"),
         ("/picture?frame=still&n=9999999999999999", 400, "n: expected a whole number"),

@@ -66,7 +66,7 @@ def dazzled(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("words", "queries"),
     [
-        (["--method", "sgd", "--rate", "0.5"], 3),
+        (["--method", "sgd", "--rate", "1"], 3),
         (["--method", "sgd", "--step-form", "raw", "--rate", "2", "--momentum", "0.5"], 3),
         (["--momentum", "1"], 3),
         (["--method", "scw", "--queries", "5", "--norm", "1"], 5),
