@@ -82,7 +82,8 @@ def compute_night_maps(scene: SceneIR, background: Tensor) -> NightMaps:
     fixed = torch.from_numpy(np.stack([*planes])).to(like)
     glare = glare + lamps + ((1 - sky) * missed * glow)[..., None] * np.array(model.GLOW_RGB)
     glare, shining = (
-        torch.from_numpy(np.ascontiguousarray(np.moveaxis(light, 2, 0))).to(like.dtype) for light in (glare, shining)
+        torch.from_numpy(np.ascontiguousarray(np.moveaxis(light, 2, 0))).to(like.dtype)
+        for light in (glare, shining)
     )
     far, flat = scene.depth.cpu(), scene.environment.road.cpu()
     mirrored = mirror_in_ground(shining, 1.0 / far, flat, rise, camera_m)
