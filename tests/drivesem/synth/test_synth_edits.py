@@ -191,7 +191,7 @@ def test_daylight_falls_with_the_code_of_night(plan):
     assert frames[-1].image.mean() < 0.5 * frames[0].image.mean()
 
 
-def test_lamps_by_day_change_nothing_unless_they_brake(plan):
+def test_lamps_by_day_leave_the_picture_unless_they_brake(plan):
     day, off, brake = (render_edit(plan, objects={ALL: ObjectEdit(lamps=code)}) for code in (0.0, -1.0, 1.0))
     assert day.image.tobytes() == off.image.tobytes()
     redder = brake.image[..., 0].astype(int) - day.image[..., 0]

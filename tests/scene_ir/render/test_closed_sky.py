@@ -86,7 +86,7 @@ def test_clouds_take_the_sun_away(shaded: SceneIR) -> None:
     torch.testing.assert_close(dark[:, -4:, width - 4 :], light[:, -4:, width - 4 :], atol=0.02, rtol=0)
 
 
-def test_kept_with_the_scene(shaded: SceneIR, tmp_path: Path) -> None:
+def test_stored_with_the_scene(shaded: SceneIR, tmp_path: Path) -> None:
     shaded = convert_scene(shaded, torch.float32)
     save_scene(shaded, tmp_path / "scene")
     found = load_scene(tmp_path / "scene").environment.closed_sky
