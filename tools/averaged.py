@@ -14,6 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d
 
 from detectors.registry import read_weights, write_weights
 
@@ -119,3 +120,13 @@ class AveragedRun(Generic[Network]):
     def _fingerprint(self) -> str:
         settings: Any = self.settings
         return json.dumps(asdict(settings), sort_keys=True)
+
+
+def multiscale_error(apart: Tensor, gradient: float) -> Tensor:
+    """Mean absolute value () of differences (N, C, h, w), and of their slopes at three scales with a weight."""
+    loss = apart.abs().mean()
+    for _ in range(3):
+        slopes = apart.diff(dim=2).abs().mean() + apart.diff(dim=3).abs().mean()
+        loss = loss + gradient * slopes
+        apart = avg_pool2d(apart, 2)
+    return loss

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from averaged import AveragedRun
+from averaged import AveragedRun, multiscale_error
 from torch import Tensor
 from train_segmenter import (
     HORIZON_ERROR,
@@ -184,12 +184,7 @@ def compute_loss(found: Tensor, true: Tensor, sky: Tensor, gradient: float) -> T
     """
     weight = 1 - F.max_pool2d(sky, 2)
     apart = (found - true) * weight
-    loss = apart.abs().mean()
-    for _ in range(3):
-        slopes = apart.diff(dim=2).abs().mean() + apart.diff(dim=3).abs().mean()
-        loss = loss + gradient * slopes
-        apart = F.avg_pool2d(apart, 2)
-    return loss
+    return multiscale_error(apart, gradient)
 
 
 class DelightRun(AveragedRun[DelightNet]):

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from averaged import AveragedRun
+from averaged import AveragedRun, multiscale_error
 from torch import Tensor
 from train_segmenter import (
     CLASS_OF,
@@ -197,12 +197,7 @@ def compute_loss(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float)
     w/2): the network's; ground, near (N, 1, h, w)."""
     found = F.avg_pool2d(ground, 2) + depth.nearness_excess(numbers)
     apart = (found + LEAST_NEARNESS).log() - (F.avg_pool2d(near, 2) + LEAST_NEARNESS).log()
-    loss = apart.abs().mean()
-    for _ in range(3):
-        slopes = apart.diff(dim=2).abs().mean() + apart.diff(dim=3).abs().mean()
-        loss = loss + gradient * slopes
-        apart = F.avg_pool2d(apart, 2)
-    return loss
+    return multiscale_error(apart, gradient)
 
 
 class DepthRun(AveragedRun[DepthNet]):
