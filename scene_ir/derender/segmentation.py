@@ -101,11 +101,13 @@ belong to no map."""
 _TERRAIN = "terrain"
 """Virtual KITTI's name of all ground except roads: the network decides whether it is grass."""
 REQUIRED_MAPS = ("sky", "foliage", "road")
-_SURE_SKY, _UNSURE_SKY, _SKY_AROUND, _SKY_DARKER = 0.9, 0.12, 0.1, (-0.15, -0.06)
-"""Share from which a pixel is sky for certain, and from which one may be; the least share of such sky around it; how
-much darker than it sky may be.
-"""
 """Maps that a segmenter's classes must fill."""
+_SURE_SKY, _UNSURE_SKY, _SKY_AROUND, _SKY_DARKER = 0.9, 0.12, 0.1, (-0.15, -0.06)
+_CLOUD_DARKER, _CLOUD_DETAIL, _BLUE_DIFFERS, _BLUE = (-0.5, -0.4), (-0.12, -0.06), (-0.35, -0.25), (0.1, 0.2)
+"""Share from which a pixel is sky for certain, and from which one may be; the least share of such sky around it; how
+much darker than it sky may be; the same of smooth clouds, and their differences within 5 px; how much a blue sky
+differs from that around it, and its blue less its red.
+"""
 _GROUND_ENDS, _SKY_ENDS = 0.02, -0.012
 """Sines of the elevation above which there is no ground, and below which there is no sky. Hills and the plane's
 error lie between."""
@@ -214,16 +216,25 @@ def segment_photograph(
 
 def _complete_sky(sky: Array, image: Array) -> Array:
     """The map (H, W) of the sky with its gaps filled: the network is unsure of clouds around a pole, while what stands
-    before a sky is darker than it.
+    before a sky is darker than it or has edges; and it misses a blue sky behind bare branches.
     """
     reach = max(3, image.shape[0] // 4)
     luma = image @ np.array(LUMA, np.float32)
     sure = (sky > _SURE_SKY).astype(np.float32)
     weight = cv2.blur(sure, (reach, reach))
-    around = cv2.blur(luma * sure, (reach, reach)) / np.maximum(weight, 1e-3)
-    bright = np.clip((luma - around - _SKY_DARKER[0]) / (_SKY_DARKER[1] - _SKY_DARKER[0]), 0, 1)
-    possible = np.clip(sky / _UNSURE_SKY, 0, 1) * (weight > _SKY_AROUND)
-    return np.maximum(sky, possible * bright)
+    around = cv2.blur(image * sure[..., None], (reach, reach)) / np.maximum(weight, 1e-3)[..., None]
+    darker = luma - around @ np.array(LUMA, np.float32)
+    detail = cv2.morphologyEx(cv2.blur(luma, (3, 3)), cv2.MORPH_GRADIENT, np.ones((5, 5)))
+    clouds = np.maximum(_rise(darker, _SKY_DARKER), _rise(darker, _CLOUD_DARKER) * _rise(-detail, _CLOUD_DETAIL))
+    blue = np.minimum(around[..., 2] - around[..., 0], image[..., 2] - image[..., 0])
+    gaps = _rise(-np.abs(image - around).max(-1), _BLUE_DIFFERS) * _rise(blue, _BLUE)
+    possible = np.maximum(np.clip(sky / _UNSURE_SKY, 0, 1) * clouds, gaps)
+    return np.maximum(sky, (weight > _SKY_AROUND) * possible)
+
+
+def _rise(values: Array, ends: tuple[float, float]) -> Array:
+    """0 up to the lower end, 1 from the upper one."""
+    return np.clip((values - ends[0]) / (ends[1] - ends[0]), 0, 1)
 
 
 def apply_frame_classes(frame: Frame, estimated: Segmentation) -> Segmentation:

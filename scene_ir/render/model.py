@@ -250,7 +250,7 @@ HAZE_CAP_M = 300.0
 
 NIGHTFALL = 4.0
 """Rate at which the share of night grows with its code: light falls by about equal factors."""
-STREET_RGB, STREET_BASE = (0.42, 0.31, 0.20), 0.06
+STREET_RGB, STREET_BASE = (0.31, 0.21, 0.13), 0.06
 """Light of street lamps relative to daylight, after the camera's exposure, in the middle of their pools; its share
 between them.
 """
@@ -266,7 +266,7 @@ each side, and of the farthest.
 """
 STREET_LAMP_RGB, STREET_LAMP_AT_10_M = (1.0, 0.80, 0.52), 7.0
 """Colour of a street lamp, and the radius of its image in px at 10 m and 720 lines."""
-HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (24.0, 210.0, 3.0), (5.5, 14.0), (3.6, 6.5)
+HOUSE_LAMPS_M, HOUSE_ASIDE_M, HOUSE_LAMP_HEIGHT_M = (24.0, 210.0, 1.8), (5.5, 14.0), (3.6, 6.5)
 """Lamps at houses and crossings: first and last distance along the street and that between two; distance from the
 camera's path; height, above what a car hides.
 """
@@ -274,11 +274,11 @@ HOUSE_LAMP_RGB = ((1.0, 0.80, 0.50), (1.0, 0.95, 0.85), (0.9, 0.97, 1.0), (0.15,
 """Their colours: lamps, windows, signs, traffic lights."""
 LAMP_SHOWS = 0.9
 """Depth, relative to a lamp's, up to which a surface hides it: depths of a street's sides are estimates."""
-GLOW_RGB = (0.0060, 0.0059, 0.0060)
+GLOW_RGB = (0.0050, 0.0042, 0.0039)
 """Light of the sky over a town, at the horizon."""
 GLOW_HEIGHT = 0.6
 """Share of the picture's height over which that glow falls by a factor e."""
-HEAD_RGB, HEAD_FAR_M = (0.95, 0.82, 0.66), 20.0
+HEAD_RGB, HEAD_FAR_M = (1.30, 1.07, 0.85), 24.0
 """Light of the own headlamps, relative to daylight, on what is near; distance at which it has fallen to half."""
 SUN_SOFTENED = 0.2
 """Compression of daylight before street lamps replace it: sunlit surfaces come closer to those in the shade."""
@@ -286,7 +286,7 @@ RETRO_WHITE = 1.5
 """Growth of the headlamps' light on the brightest surfaces: road markings and number plates send light back."""
 HEAD_AIM, HEAD_SIDE = 0.32, 0.12
 """Width of the beam, as a tangent, and its share far aside."""
-HEAD_CUT_M, HEAD_SOFT_M, HEAD_ABOVE = 0.9, 0.25, 0.10
+HEAD_CUT_M, HEAD_SOFT_M, HEAD_ABOVE = 0.9, 0.25, 0.15
 """Height above the ground at which the beam is cut off, width of that edge, and share of the light above it."""
 RETRO, RETRO_CHROMA = 5.0, (0.30, 0.45)
 """Gain of the headlamps on signs, which send light back, and the chroma from which an area may be one, and is."""
@@ -296,7 +296,7 @@ light, as the camera opens.
 """
 LIT_HEIGHT_M = (1.0, 1.5)
 """Height above the ground from which it may be one, and is: sunlit patches on the ground are none."""
-GLARE = ((0.005, 0.5), (0.018, 0.3), (0.07, 0.10))
+GLARE = ((0.004, 0.5), (0.012, 0.3), (0.06, 0.08))
 """Glare of lamps: standard deviations, in heights of the picture, and shares of their light."""
 LIT_MIRROR = 12.0
 """Light of lamps that a wet road mirrors, relative to that of their images, which are clipped."""
@@ -304,7 +304,7 @@ GLARE_FOG, GLARE_RAIN = 3.0, 1.5
 """Relative growth of glare at fog 1 and rain 1."""
 CORNER = 0.45
 """Loss of light at the picture's corners, with the lens wide open."""
-NOISE, NOISE_LEVEL = 0.0012, 0.012
+NOISE, NOISE_LEVEL = 0.0006, 0.012
 """Standard deviation of the noise at black, and its growth with the display value."""
 NIGHT_BEND = 0.02
 """Display value about which the root that converts night's light to display values bends."""
@@ -315,7 +315,7 @@ LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0, 1.2)
 """Rates at which fog, rain, time, overcast, night and snow make drivers switch on their lamps."""
 TAIL_LAMP_RGB, HEADLAMP_RGB = (3.2, 0.12, 0.08), (8.0, 7.2, 6.0)
 """Light of a lamp that faces the camera by night; white is 1."""
-TAIL_CORE = 0.12
+TAIL_CORE = 0.25
 """Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
 LAMP_STRETCH = (1.5, 0.7)
 """Width and height of a lamp, relative to its radius."""
