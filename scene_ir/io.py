@@ -207,7 +207,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
                 for name, width in _ENVIRONMENT_FIELDS.items()
             },
             **{name: arrays.tensor(name, *size) for name in _MAPS},
-            closed_sky=arrays.tensor(_CLOSED_SKY, 3, None, None) if _CLOSED_SKY in arrays else None,
+            closed_sky=arrays.tensor(_CLOSED_SKY, 2, 3, None, None) if _CLOSED_SKY in arrays else None,
             ego=arrays.tensor("ego", *size) if "ego" in arrays else None,
         )
     )

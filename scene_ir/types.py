@@ -326,8 +326,8 @@ class Environment:
     light: Tensor = field(default_factory=lambda: torch.zeros(LIGHT_DIM))
     """(3,) in [-1, 1]; 0 is as photographed."""
     closed_sky: Tensor | None = None
-    """(3, h, w) in [0, 1], the background under a closed sky as codes of its ratio to the photographed one:
-    exp((2 code - 1) `render.model.CLOSED_SKY_LOG`); None for what is not known."""
+    """(2, 3, h, w) in [0, 1], background and photograph under a closed sky, as codes of the ratio to what they are:
+    exp((2 code - 1) `render.model.CLOSED_SKY_LOG`); the second is for the vehicles. None for what is not known."""
     ego: Tensor | None = None
     """(H, W) in [0, 1], opacity of the ego vehicle (bonnet, dashboard), which no code changes; None if the photograph
     does not show it."""
@@ -345,7 +345,7 @@ class Environment:
         check_shape("environment.foliage_map", self.foliage_map, *self.sky.shape)
         check_shape("environment.road", self.road, *self.sky.shape)
         if self.closed_sky is not None:
-            check_shape("environment.closed_sky", self.closed_sky, 3, None, None)
+            check_shape("environment.closed_sky", self.closed_sky, 2, 3, None, None)
         if self.ego is not None:
             check_shape("environment.ego", self.ego, *self.sky.shape)
         for name in ("weather", "foliage", "light", "sun", "ground"):

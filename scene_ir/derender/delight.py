@@ -45,7 +45,7 @@ def estimate_closed_sky(image: Array, ground: Tensor, camera: Camera, network: D
         network: In place of the shipped one.
 
     Returns:
-        `Environment.closed_sky`, (3, h, w), multiples of 1 / 255.
+        Codes (3, h, w) as of `Environment.closed_sky`, multiples of 1 / 255.
     """
     logits = (network or load_network()).predict(unet.prepare_input(image, ground, camera))[0]
     return (torch.sigmoid(logits) * 255).round() / 255

@@ -189,13 +189,13 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     if ego_mask is not None:
         regions = torch.cat([other_labels.ignore_xyxy, ego.ignored_regions(ego_mask).to(other_labels.ignore_xyxy)])
         other_labels = replace(other_labels, ignore_xyxy=regions)
+    pictures = (background, frame.photograph.float().permute(1, 2, 0).numpy())
+    closed_sky = torch.stack([delight.estimate_closed_sky(picture, ground, camera) for picture in pictures])
     scene = SceneIR(
         camera,
         meshes,
         objects,
-        _make_environment(
-            maps, ground, sun, vehicles, delight.estimate_closed_sky(background, ground, camera), ego_opacity
-        ),
+        _make_environment(maps, ground, sun, vehicles, closed_sky, ego_opacity),
         frame.photograph.float(),
         torch.from_numpy(np.ascontiguousarray(background.transpose(2, 0, 1))),
         depth_m,

@@ -62,8 +62,8 @@ def compute_closed_sky_gain(closed_sky: Tensor, background: Tensor, sky: Tensor,
     end. The sky does not change: its colour is the weather's.
 
     Args:
-        closed_sky: (3, h, w), see `Environment.closed_sky`.
-        background: (3, H, W) RGB in [0, 1].
+        closed_sky: (3, h, w) codes of a picture, see `Environment.closed_sky`.
+        background: (3, H, W) RGB in [0, 1], that picture.
         sky: (H, W) in [0, 1].
         focal_px: Focal length.
     """
@@ -363,6 +363,8 @@ class PerturbedSun:
     """() Light relative to the photographed sun."""
     shade: Tensor
     """() Strength of its shadows relative to the photographed ones."""
+    hidden: Tensor
+    """() How far clouds hide it, in [0, 1]; 0 where it is not known how the scene looks without it."""
 
     @classmethod
     def from_environment(cls, environment: Environment, like: Tensor, sunlight: Tensor) -> PerturbedSun:
@@ -383,9 +385,11 @@ class PerturbedSun:
         shade = _shadow_strength(direction, up, sunlight * strength) / _shadow_strength(sun, up, sunlight).clamp(
             min=1e-6
         )
+        hidden = torch.zeros_like(strength)
         if environment.closed_sky is not None:
-            strength = strength * sunlight_share(environment.weather.to(like))
-        return cls(direction, strength, torch.where(sunlight > 0, shade, torch.ones_like(shade)))
+            hidden = 1.0 - sunlight_share(environment.weather.to(like))
+            strength = strength * (1.0 - hidden)
+        return cls(direction, strength, torch.where(sunlight > 0, shade, torch.ones_like(shade)), hidden)
 
 
 def move_sun(sun: Tensor, up: Tensor, code: Tensor) -> Tensor:

@@ -175,6 +175,8 @@ CLOSED_SKY_LOG = 1.5
 """Bound of the logarithm of what a closed sky changes: no pixel becomes more than 4.5 times as bright, or as dark."""
 CLOSED_SKY_OFFSET = 0.02
 """Added to display values before their logarithm is taken."""
+CLOSED_SKY_RELIT = (-0.6, 1.0)
+"""Bounds of the brightening of a vehicle's surface under a closed sky."""
 CLOSED_SKY_BURNT = (0.9, 1.0)
 """Highest channel of a pixel from which, and at which, it has lost its colour: there all channels change alike."""
 CLOSED_SKY_RADIUS, CLOSED_SKY_EDGE = 0.02, 2e-3

@@ -370,14 +370,54 @@ class PreparedScene:
 
     @cached_property
     def closed_sky_gain(self) -> Tensor | None:
-        """See `environment.compute_closed_sky_gain`; None where the closed sky is not known."""
+        """Of the background, see `environment.compute_closed_sky_gain`; None where the closed sky is not known."""
+        return self._closed_sky_gain(0, self.scene.background)
+
+    def _closed_sky_gain(self, which: int, picture: Tensor) -> Tensor | None:
         environment, camera = self.scene.environment, self.scene.camera
         if environment.closed_sky is None:
             return None
         gain = compute_closed_sky_gain(
-            environment.closed_sky, self.scene.background, environment.sky, float(camera.intrinsics[0, 0])
+            environment.closed_sky[which], picture, environment.sky, float(camera.intrinsics[0, 0])
         )
         return gain.to(self.like)
+
+    @cached_property
+    @torch.no_grad()
+    def closed_sky_brightening(self) -> Tensor:
+        """Brightening (V,) of the photographed surfaces under a closed sky, less that by the sun alone, which
+        `compute_brightening` has; of surfaces that the photograph does not show, the mean of their vehicle's others.
+        """
+        gain = self._closed_sky_gain(1, self.scene.photograph.to(self.like))
+        sources, owner = self.scene.objects.source, self.surfaces.owner
+        if gain is None or not sources:
+            return self.like.new_zeros(owner.shape[0])
+        luma = self.like.new_tensor(model.LUMA)[:, None]
+        height, width = self.frame_hw
+        clip = self.base_geometry.clip
+        columns, rows = (clip[:, :2] / clip[:, 2:].clamp(min=1e-3)).round().long().unbind(1)
+        columns, rows = columns.clamp(0, width - 1), rows.clamp(0, height - 1)
+        seen = self.base_geometry.facing_cos > 0.0
+        for i, source in enumerate(sources):
+            crop, own = source.foreground, (owner == i).nonzero()[:, 0]
+            row, column = rows[own] - crop.y0, columns[own] - crop.x0
+            h, w = crop.values.shape[1:]
+            inside = (row >= 0) & (row < h) & (column >= 0) & (column < w)
+            opaque = torch.zeros_like(inside)
+            opaque[inside] = crop.values.to(self.like)[3, row[inside], column[inside]] > model.SOLID_ALPHA[1]
+            seen[own] &= opaque
+        now = self.scene.photograph.to(self.like)[:, rows, columns]
+        bent = (1.0 - now.square()).clamp(min=1.0 - model.CLOSED_SKY_BURNT[0] ** 2)  # as `texture.relight` bends it
+        wanted = (luma * now * gain[:, rows, columns]).sum(0) / (luma * now * bent).sum(0).clamp(min=1e-3)
+        hidden = PerturbedSun(
+            self.scene.environment.sun.to(self.like), self.like.new_zeros(()), self.like.new_ones(()), self.like.new_ones(())
+        )
+        more = wanted.clamp(*model.CLOSED_SKY_RELIT) - self.compute_brightening(
+            at_photographed_pose(self.scene.objects), hidden
+        )
+        count = self.like.new_zeros(len(sources)).index_add(0, owner, seen.to(self.like))
+        mean = self.like.new_zeros(len(sources)).index_add(0, owner, more * seen) / count.clamp(min=1.0)
+        return torch.where(seen, more, mean[owner])
 
     def local_vertices(self, objects: Objects) -> Tensor:
         """Vertices (V, 3) m in their objects' frames."""
@@ -670,13 +710,16 @@ class SceneBatch:
             clip, cos = surfaces.place_vertices(
                 m.local_vertices(o), m.smooth_normals, m.surfaces.owner, o, matrix, m.centre
             )
-            return PlacedGeometry(clip, cos, m.place_patches(o, sun), m.compute_brightening(o, sun))
+            brighter = m.compute_brightening(o, sun) + closed_sky_brightening([m], suns)
+            return PlacedGeometry(clip, cos, m.place_patches(o, sun), brighter)
         lit = list(zip(self._members, objects, suns, strict=True))
         lights = concat([m.object_lights(sun) for m, _, sun in lit])
         ffd, size, yaw, translation = (
             concat([getattr(o, name) for o in objects]) for name in ("ffd", "size_lhw", "yaw", "translation")
         )
         clip, cos, brighter, _ = surfaces.place_with_kernels(self._placement, ffd, size, yaw, translation, lights)
+        if any(sun is not None for sun in suns):
+            brighter = brighter + closed_sky_brightening(self._members, suns)
         if with_ground:
             return PlacedGeometry(
                 clip, cos, concat([m.place_patches(o, sun) for m, o, sun in lit]), brighter, lights
@@ -740,6 +783,15 @@ class SceneBatch:
         if with_ground:
             ground = verbs.rasterize(geometry.patch_clip, faces, face_ranges, ground_layout, backend)
         return VisibleSurfaces(geometry, mesh, coverage, tuple(reach), ground_layout, ground)
+
+
+def closed_sky_brightening(members: Sequence[PreparedScene], suns: Sequence[PerturbedSun | None]) -> Tensor:
+    """Brightening (V,) of the members' surfaces as far as clouds hide their suns."""
+    parts = [
+        m.like.new_zeros(m.surfaces.owner.shape[0]) if sun is None else sun.hidden * m.closed_sky_brightening
+        for m, sun in zip(members, suns, strict=True)
+    ]
+    return concat(parts)
 
 
 def concat(parts: Sequence[Tensor]) -> Tensor:

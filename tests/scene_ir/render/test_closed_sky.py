@@ -1,5 +1,6 @@
 """The light of a closed sky in a picture: bounds, edges, identity, gradients, and what is kept with a scene."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -57,8 +58,9 @@ def test_each_code_covers_the_sun() -> None:
 def shaded(photographed: SceneIR) -> SceneIR:
     """A scene whose lower left a closed sky would darken."""
     height, width = photographed.environment.sky.shape
-    closed_sky = torch.full((3, height // 8, width // 8), 0.5)
-    closed_sky[:, height // 16 :, : width // 16] = 0.3
+    closed_sky = torch.full((2, 3, height // 8, width // 8), 0.5)
+    closed_sky[0, :, height // 16 :, : width // 16] = 0.3
+    closed_sky[1, :, :, width // 16 :] = 0.6
     return replace(photographed, environment=replace(photographed.environment, closed_sky=closed_sky))
 
 
@@ -84,6 +86,26 @@ def test_clouds_take_the_sun_away(shaded: SceneIR) -> None:
     width = light.shape[2]
     assert float(dark[:, -4:, :4].mean()) < 0.8 * float(light[:, -4:, :4].mean())
     torch.testing.assert_close(dark[:, -4:, width - 4 :], light[:, -4:, width - 4 :], atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("backend", ["warp", "reference"])
+def test_vehicles_have_the_light_of_the_photographs_map(shaded: SceneIR, backend: str) -> None:
+    scene = convert_scene(shaded, torch.float32) if backend == "warp" else shaded
+    closed_sky = scene.environment.closed_sky
+    assert closed_sky is not None
+    even = torch.stack([closed_sky[0], torch.full_like(closed_sky[1], 0.5)])
+    same = replace(scene, environment=replace(scene.environment, closed_sky=even))
+    settings = RenderSettings(backend=backend)  # type: ignore[arg-type]
+    compositor, unchanged = Compositor(scene, settings), Compositor(same, settings)
+    lit = compositor.closed_sky_brightening - unchanged.closed_sky_brightening
+    # a code of 0.6 is a gain of exp(0.3), for all but what is nearly white
+    assert float(lit.max()) > math.expm1(0.3)
+    bright, plain = (c.render(_under(scene, Weather.OVERCAST, 1.0)) for c in (compositor, unchanged))
+    change = bright.image - plain.image
+    assert float(change.min()) > -1e-6
+    changed = change.amax(dim=0) > 0.01
+    assert bool(changed.any())
+    assert bool((bright.object_id[changed] > 0).float().mean() > 0.9)
 
 
 def test_stored_with_the_scene(shaded: SceneIR, tmp_path: Path) -> None:
