@@ -407,11 +407,12 @@ class PreparedScene:
             opaque[inside] = crop.values.to(self.like)[3, row[inside], column[inside]] > model.SOLID_ALPHA[1]
             seen[own] &= opaque
         now = self.scene.photograph.to(self.like)[:, rows, columns]
-        bent = (1.0 - now.square()).clamp(min=1.0 - model.CLOSED_SKY_BURNT[0] ** 2)  # as `texture.relight` bends it
+        bent = (1.0 - now.square()).clamp(
+            min=1.0 - model.CLOSED_SKY_BURNT[0] ** 2
+        )  # as `texture.relight` bends it
         wanted = (luma * now * gain[:, rows, columns]).sum(0) / (luma * now * bent).sum(0).clamp(min=1e-3)
-        hidden = PerturbedSun(
-            self.scene.environment.sun.to(self.like), self.like.new_zeros(()), self.like.new_ones(()), self.like.new_ones(())
-        )
+        none, one = self.like.new_zeros(()), self.like.new_ones(())
+        hidden = PerturbedSun(self.scene.environment.sun.to(self.like), none, one, one)
         more = wanted.clamp(*model.CLOSED_SKY_RELIT) - self.compute_brightening(
             at_photographed_pose(self.scene.objects), hidden
         )
