@@ -98,13 +98,16 @@ def find_lamp_places(mesh: Mesh) -> Tensor:
 
 
 def is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
-    """Whether () a vehicle stands where one drives: there is road beyond its side that faces away from the camera's
-    path, or the camera's path leads through it. In [0, 1].
+    """Whether () a vehicle stands where one drives, in [0, 1]: along the camera's path, and in it, or coming towards
+    it in the next lane, or with road beyond its side that faces away from that path.
     """
     x, y, z = base.translation[i].double().tolist()
-    half = 0.5 * float(base.size_lhw[i, 2])
-    if abs(x) < half + 0.5 or z < 1.0:
+    half, towards = 0.5 * float(base.size_lhw[i, 2]), base.yaw[i].double().sin()
+    if z < 1.0:
         return torch.tensor(1.0)
+    along = smoothstep(towards.abs(), *model.DRIVEN_ALONG)
+    if abs(x) < half + 0.5 or (towards > 0 and abs(x) < model.NEXT_LANE_M):
+        return along
     outward = 1.0 if x > 0 else -1.0
     places = [
         [x + outward * (half + aside), y, z + along] for aside in (0.8, 1.4, 2.0) for along in (-1.5, 0.0, 1.5)
@@ -114,9 +117,9 @@ def is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
     height, width = scene.environment.road.shape
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     if not bool(inside.any()):
-        return torch.tensor(1.0)
+        return along
     road = scene.environment.road.cpu()[rows[inside], columns[inside]].double().mean()
-    return smoothstep(road, *model.DRIVEN_ROAD)
+    return along * smoothstep(road, *model.DRIVEN_ROAD)
 
 
 def _are_red(foreground: Crop, places: Tensor, reach_px: float) -> bool:

@@ -302,7 +302,7 @@ GLARE = ((0.004, 0.5), (0.012, 0.3), (0.06, 0.08))
 """Glare of lamps: standard deviations, in heights of the picture, and shares of their light."""
 LIT_MIRROR = 12.0
 """Light of lamps that a wet road mirrors, relative to that of their images, which are clipped."""
-GLARE_FOG, GLARE_RAIN = 3.0, 1.5
+GLARE_FOG, GLARE_RAIN = 1.5, 0.6
 """Relative growth of glare at fog 1 and rain 1."""
 CORNER = 0.45
 """Loss of light at the picture's corners, with the lens wide open."""
@@ -323,7 +323,7 @@ LAMP_STRETCH = (1.5, 0.7)
 """Width and height of a lamp, relative to its radius."""
 BRAKE_LAMP, LAMP_BEND = 2.5, 6.0
 """Light of a brake lamp, relative to a tail lamp's; how sharply lamps code 0 separates off from braking."""
-LAMP_BY_DAY, LAMP_EXPOSURE = 0.12, (0.25, 0.3, 0.9, 0.1, 4.0, 0.2)
+LAMP_BY_DAY, LAMP_EXPOSURE = 0.08, (0.15, 0.12, 0.3, 0.05, 4.0, 0.1)
 """The same by daylight, where the exposure is shorter; rates at which fog, rain, time, overcast, night and snow make it
 longer.
 """
@@ -335,7 +335,7 @@ HEADLAMP_WIDE = 0.15
 """Share of a headlamp's light outside of its beam."""
 STREAK, STREAK_SHARE = (0.05, 0.0015), 0.02
 """Widths of the streak across a lamp, in heights of the picture, and its share of the light."""
-DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH, MIRROR_WIDTH = 0.006, 0.5, 0.35, 1.8
+DRY_MIRROR, WET_MIRROR, MIRROR_LENGTH, MIRROR_WIDTH = 0.006, 0.2, 0.35, 1.8
 """Brightness of a lamp's image in a dry road, and in a wet one of what it mirrors; length of that image, in distances
 from the lamp, and its width, in widths of the lamp.
 """
@@ -345,5 +345,9 @@ TAIL_LAMP_RED, HEADLAMP_WHITE = (0.12, 0.25), (0.70, 0.85)
 """Excess of red, and least channel, from which a pixel may be, and is, a tail lamp or a headlamp."""
 RED_LAMPS = (0.06, 2.5)
 """Share of red around lamps from which they are tail lamps, and how much more that is than on the whole vehicle."""
-DRIVEN_ROAD = (0.35, 0.75)
-"""Share of road beyond a vehicle's outer side from which it may drive, and does."""
+DRIVEN_ROAD, DRIVEN_ALONG = (0.35, 0.75), (0.65, 0.8)
+"""Share of road beyond a vehicle's outer side from which it may drive, and does; the same of the cosine between its
+heading and the camera's path.
+"""
+NEXT_LANE_M = 4.4
+"""Distance from the camera's path within which an oncoming vehicle drives."""

@@ -166,3 +166,23 @@ def test_the_shipped_weights_are_small_and_anothers_are_refused():
     assert sum(p.numel() for p in segment.load_network().parameters()) < 500_000
     with pytest.raises(FormatError, match="pose"):
         segment.load_network(segment.WEIGHTS.with_name("pose.safetensors"))
+
+
+def test_the_sky_has_grey_clouds_and_gaps_between_branches_but_no_poles():
+    image = np.full((120, 200, 3), (0.3, 0.5, 0.9), np.float32)
+    sky = np.ones((120, 200), np.float32)
+    cloud, pole, gap, branch = np.s_[10:40, 60:100], np.s_[0:80, 78:82], np.s_[50:60, 20:30], np.s_[48:62, 30:34]
+    image[cloud], sky[cloud] = (0.5, 0.5, 0.55), 0.3
+    image[pole], sky[pole] = (0.12, 0.12, 0.12), 0.3
+    sky[gap] = 0.0
+    image[branch], sky[branch] = (0.2, 0.15, 0.1), 0.0
+    blue_wall = np.s_[90:120, 0:40]
+    sky[80:] = 0.0
+    image[80:] = 0.4
+    image[blue_wall] = (0.05, 0.1, 0.5)
+    found = segment._complete_sky(sky, image)
+    assert found[15:35, 64:72].min() > 0.9
+    assert found[12:70, 79:81].max() < 0.4
+    assert found[53:58, 22:27].min() > 0.9
+    assert found[50:60, 31:33].max() == 0.0
+    assert found[blue_wall].max() == 0.0
