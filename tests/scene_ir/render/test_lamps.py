@@ -10,7 +10,7 @@ from scene_ir.meshes.templates import KINDS, template
 from scene_ir.render import lamps, model
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import WEATHER_DIM, Crop, SceneIR, Weather
+from scene_ir.types import WEATHER_DIM, Crop, Objects, SceneIR, Weather
 
 ONCOMING, AHEAD = 0, 1
 """Rows of a car that faces the camera and of one that faces away."""
