@@ -38,10 +38,10 @@ __all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits
 
 _GAMMA = 2.2
 """Display values to linear light."""
-DRAWN_WEATHER = (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST, Weather.NIGHT)
-"""Codes of weather that the generator draws."""
 _CLOSED_SKY = 1.15
 """Light of a closed sky, relative to the mean light at the horizon of a clear one."""
+_SNOW_PER_M, _SNOW_COVER = 0.003, 0.95
+"""Extinction and clouds of snow 1: moderate snow."""
 _WET_NIGHTS, _BRAKING, _UNLIT = 0.3, 0.25, 0.03
 """Shares of nights in rain, and of drivers who brake or have no lamps on."""
 
@@ -154,11 +154,10 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
     """Light under a weather code: physical counterparts of what the compositor does to the picture."""
     if not any(code):
         return light
-    for weather in Weather:
-        if code[weather] and weather not in DRAWN_WEATHER:
-            name = f"weather.{weather.name.lower()}"
-            raise RangeError(name, "0, since generated streets are drawn without it", code[weather])
-    fog, rain, time, overcast = (code[w] for w in (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST))
+    fog, rain, time, overcast, snow = (
+        code[w] for w in (Weather.FOG, Weather.RAIN, Weather.TIME, Weather.OVERCAST, Weather.SNOW)
+    )
+    overcast = 1 - (1 - overcast) * (1 - _SNOW_COVER * snow)
     cover = 1 - (1 - overcast) * (1 - 0.9 * rain) * (1 - 0.6 * fog)
     grey = float(np.mean(light.horizon)) * (1 - 0.3 * rain)
     low_sun = low_sun_share(*(torch.tensor(value, dtype=torch.float64) for value in (fog, rain, overcast)))
@@ -177,7 +176,11 @@ def _weathered(light: Light, code: tuple[float, ...]) -> Light:
         horizon=toward(light.horizon, _CLOSED_SKY * grey),
         ambient=toward(light.ambient, float(np.mean(light.ambient + 0.45 * sun_lost)), daylight),
         clouds=max(light.clouds, cover),
-        haze_per_m=light.haze_per_m + FOG_EXTINCTION_PER_M * fog + RAIN_EXTINCTION_PER_M * rain,
+        haze_per_m=light.haze_per_m
+        + FOG_EXTINCTION_PER_M * fog
+        + RAIN_EXTINCTION_PER_M * rain
+        + _SNOW_PER_M * snow,
         wet=max(light.wet, rain),
+        snow=max(light.snow, snow),
     )
     return darken(light, code)

@@ -24,6 +24,9 @@ from drivesem.synth.light import (
     PANORAMA_GLARE,
     SHADOW_OFFSET_M,
     SHADOW_OFFSET_TEXELS,
+    SLUSH_PATCHES,
+    SLUSH_RGB,
+    SLUSH_SHARE,
     SOAKED,
     Light,
     Response,
@@ -65,6 +68,10 @@ LEAF_DEPTH, OFFSET, PER_TEXEL = (
     wp.constant(wp.float32(v)) for v in (LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS)
 )
 GLARE = wp.constant(wp.float32(PANORAMA_GLARE))
+SLUSH, SLUSHY, PATCHES = (
+    wp.constant(wp.vec3f(*SLUSH_RGB)),
+    *(wp.constant(wp.float32(v)) for v in (SLUSH_SHARE, SLUSH_PATCHES)),
+)
 PI = wp.constant(wp.float32(np.pi))
 INFINITE = wp.constant(wp.float32(np.inf))
 CURVE, BRIGHTEST = 2048, 16.0
@@ -133,6 +140,7 @@ class Air:
     clouds: wp.float32
     cloud_seed: wp.float32
     wet: wp.float32
+    snow: wp.float32
     fog: wp.int32
     panorama: Floats
     panorama_height: wp.int32
@@ -706,6 +714,13 @@ def wetted(s: Spot, material: int, dry: wp.vec3f, air: Air, street: StreetMarkin
     return out
 
 
+@wp.func
+def slushed(s: Spot, bare: wp.vec3f, air: Air, textures: Noise):
+    patch = noise(textures.soft, s.world[0] - 9.0, s.world[2] * 0.5, 1.0 / 0.04)
+    share = air.snow * saturate(SLUSHY + PATCHES * patch)
+    return bare + (wp.cw_mul(SLUSH, irradiance(s, air)) - bare) * share
+
+
 # ------------------------------------------------------------------------------------------------------------- shadows
 
 
@@ -894,6 +909,8 @@ def pixel_kernel(
                     colour = surface(s, material, air, street, textures)
                     if air.wet > 0.0:
                         colour = wetted(s, material, colour, air, street, textures)
+                    if air.snow > 0.0 and on_ground:
+                        colour = slushed(s, colour, air, textures)
                     through = exp_(-air.haze * wp.length(s.point))
                     colour = colour * through + air.horizon * (0.6 * (1.0 - through))
                 elif air.fog == 0:
@@ -1350,7 +1367,7 @@ def _air(light: Light, lamp_rows: np.ndarray) -> Air:
     air.town = _vec(light.ambient * 0.22 + light.sun_colour * 0.03)
     air.tarmac = _vec(MIRRORED_GROUND * (light.ambient + 0.6 * light.sun_colour))
     air.haze, air.clouds, air.cloud_seed = light.haze_per_m, light.clouds, light.cloud_seed
-    air.wet, air.fog = light.wet, int(light.weather == "fog")
+    air.wet, air.snow, air.fog = light.wet, light.snow, int(light.weather == "fog")
     air.night, air.lamps, air.lamp_count = light.night, _flat(lamp_rows), len(lamp_rows)
     if light.panorama is not None:
         pixels = light.panorama.pixels

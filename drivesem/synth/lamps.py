@@ -52,8 +52,8 @@ _STREET_LIGHTS = np.array([[1.0, 0.62, 0.26], [1.0, 0.80, 0.55], [0.92, 0.95, 1.
 _HEAD_LIGHTS = np.array([[1.0, 0.84, 0.60], [0.90, 0.95, 1.0]])
 """Halogen and LED."""
 _TAIL_LIGHT = np.array([1.0, 0.05, 0.03])
-_SWITCHED_ON = np.array([1.4, 1.1, 1.5, 0.25, 3.0])
-"""How much fog, rain, time, overcast and night make drivers switch on their lamps."""
+_SWITCHED_ON = np.array([1.4, 1.1, 1.5, 0.25, 3.0, 1.1])
+"""How much fog, rain, time, overcast, night and snow make drivers switch on their lamps."""
 _ZENITH, _HORIZON = np.array([0.0007, 0.0007, 0.0009]), np.array([0.0040, 0.0033, 0.0028])
 """The sky over a town."""
 _AMBIENT = np.array([0.0080, 0.0068, 0.0056])
@@ -81,7 +81,7 @@ def night_share(code: float) -> float:
 
 def lamps_on(weather: Sequence[float]) -> float:
     """How far in [0, 1] drivers have their lamps on under weather codes; 0 at code 0."""
-    return 1.0 - float(np.exp(-np.square(_SWITCHED_ON @ np.asarray(weather)[: len(_SWITCHED_ON)])))
+    return 1.0 - float(np.exp(-np.square(_SWITCHED_ON @ np.asarray(weather))))
 
 
 def darken(light: Light, weather: Sequence[float]) -> Light:

@@ -31,7 +31,7 @@ class Panorama:
 class Light:
     """Light of a frame, in camera axes. sun (3,): towards the sun; up (3,): the ground's normal. Colours (3,) are
     linear radiance or irradiance where sunlit white is about 1. haze_per_m: extinction. clouds: cover in [0, 1].
-    wet: how much water lies on the ground, in [0, 1]. panorama: the sky, instead of gradient and clouds. heading:
+    wet, snow: how much water and slush lie on the ground, in [0, 1]; snow falls as densely. panorama: the sky, instead of gradient and clouds. heading:
     rad that the camera is turned to the right of where clouds, skyline and panorama have azimuth 0. night: share of
     night in [0, 1], by which windows are lit.
     """
@@ -47,6 +47,7 @@ class Light:
     clouds: float
     cloud_seed: float
     wet: float = 0.0
+    snow: float = 0.0
     panorama: Panorama | None = None
     heading: float = 0.0
     night: float = 0.0
@@ -156,6 +157,10 @@ SOAKED = _soaked()
 """Per material: share of light lost when wet, reflectance as a film of water, and the addition in puddles. Wet, porous
 ground is about half as bright. Source: Lekner and Dorf, Applied Optics 27 (1988).
 """
+
+
+SLUSH_RGB, SLUSH_SHARE, SLUSH_PATCHES = (0.52, 0.54, 0.57), 0.16, 0.10
+"""Albedo of slush; share of the ground that it covers at snow 1, and the deviation of that share."""
 
 
 def ground_light(light: Light) -> np.ndarray:

@@ -97,7 +97,7 @@ def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) ->
     developed, shining = np.empty((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
     touched = kernels.develop_pixels(sight, setting, maps, shadows, (developed, np.ones(pixels, bool), shining))
     touched |= bool((setting.lamps[:, -1] > 0).any())
-    return Picture(_photograph(developed, shining, setting), developed, shining, touched, maps)
+    return Picture(_photograph(sight, developed, shining, setting), developed, shining, touched, maps)
 
 
 def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Picture:
@@ -111,14 +111,52 @@ def render_without_actors(sight: Sight, full: Picture, setting: Setting) -> Pict
         maps = SunMaps(maps.rows, depth)
     developed, shining = full.developed.copy(), full.shining.copy()
     kernels.develop_pixels(sight, setting, maps, [], (developed, full.touched, shining))
-    image = _photograph(developed, shining, setting)
+    image = _photograph(sight, developed, shining, setting)
     return Picture(image, developed, shining, np.zeros_like(full.touched), maps)
 
 
-def _photograph(developed: np.ndarray, shining: np.ndarray, setting: Setting) -> np.ndarray:
+def _photograph(sight: Sight, developed: np.ndarray, shining: np.ndarray, setting: Setting) -> np.ndarray:
     """The photograph (H, W, 3) uint8 of display values and of light beyond white, each (H * W, 3)."""
     shape = (setting.view.camera.height, setting.view.camera.width, 3)
-    return take(with_glare(developed.reshape(shape), shining.reshape(shape), setting), setting)
+    image = with_glare(developed.reshape(shape), shining.reshape(shape), setting)
+    return take(with_flakes(image, sight.depth_m, setting), setting)
+
+
+def with_flakes(image: np.ndarray, depth_m: np.ndarray, setting: Setting) -> np.ndarray:
+    """Display values (H, W, 3) with falling snow: flakes at random places in the air before what is seen at `depth_m`
+    (H, W), drawn out by their fall and the drive, lit by the sky and the own headlamps.
+    """
+    light, (height, width) = setting.light, depth_m.shape
+    if light.snow == 0:
+        return image
+    rng = np.random.default_rng([*setting.grain_seed, 0x5A2])
+    k = setting.view.camera.intrinsics.double().numpy()
+    middle, focal = k[:2, 2], k[[0, 1], [0, 1]]
+    near, far = (d**3 for d in _FLAKES_M)
+    count = round(_FLAKES_PER_M3 * light.snow * height * width / float(np.prod(focal)) * (far - near) / 3)
+    z = np.cbrt(rng.uniform(near, far, count))
+    place = rng.uniform(0, [width, height], (count, 2))
+    size_m = rng.uniform(*_FLAKE_SIZE_M, count)
+    columns, rows = place.astype(int).T
+    seen = z < depth_m[rows, columns]
+    z, place, size_m = z[seen], place[seen], size_m[seen]
+    fall = np.array([0.0, _FLAKE_FALL_M])
+    end = middle + ((place - middle) * z[:, None] + focal * fall) / (z - _FLAKE_DRIVE_M)[:, None]
+    size = focal[0] * size_m / z
+    thick = np.maximum(np.rint(size), 1)
+    opacity = np.minimum(size**2 / (thick * (thick + np.linalg.norm(end - place, axis=1))), 1)
+    in_beam = (place[:, 1] - middle[1]) * z / focal[1] > setting.view.height_m - _HEADLAMP_M
+    headlit = light.night * np.where(in_beam, *_FLAKE_HEADLIT) / (1 + np.square(z))
+    layer, lamplit = np.zeros((height, width), np.uint8), np.zeros((height, width), np.float32)
+    sides = np.rint(np.stack([place, end]) * 16).astype(int)
+    values = np.stack([255 * opacity, headlit], axis=1).tolist()
+    for a, b, thickness, (share, lit) in zip(*sides.tolist(), thick.astype(int).tolist(), values, strict=True):
+        cv2.line(layer, a, b, share, thickness, cv2.LINE_AA, 4)
+        cv2.line(lamplit, a, b, lit, thickness + 2, cv2.LINE_8, 4)
+    radiance = _FLAKE_ALBEDO * (light.ambient + lamplit[..., None])
+    colour = develop(radiance.reshape(-1, 3).astype(np.float32), setting.response).reshape(image.shape)
+    veil = cv2.GaussianBlur(layer.astype(np.float32), (5, 5), _FLAKE_BLUR_PX)[..., None] / 255
+    return image + veil * (colour - image)
 
 
 def with_glare(image: np.ndarray, shining: np.ndarray, setting: Setting) -> np.ndarray:
@@ -179,6 +217,14 @@ _STREAKS = ((520, (6.0, 18.0), 1, 0.10), (130, (18.0, 46.0), 1, 0.16), (16, (50.
 """Rain at three distances: streaks in an image of KITTI's size, lengths px, thickness px, opacity."""
 _STREAK_BRIGHTNESS, _STREAK_BY_NIGHT = 0.85, 0.28
 """Display value of a drop: what lies behind, upside down, mostly sky; by night it is lit by lamps."""
+_FLAKES_PER_M3, _FLAKES_M = 25.0, (0.8, 14.0)
+"""Flakes of snow 1 in a cubic metre, and the distances within which they are drawn: those beyond are haze."""
+_FLAKE_SIZE_M, _FLAKE_ALBEDO, _FLAKE_BLUR_PX = (0.003, 0.010), 0.9, 0.8
+"""Sizes of flakes, their albedo, and the blur of their soft outlines."""
+_HEADLAMP_M, _FLAKE_HEADLIT = 0.68, (18.0, 1.3)
+"""Height of the own headlamps, and their irradiance by night a metre ahead, below that height and above."""
+_FLAKE_FALL_M, _FLAKE_DRIVE_M = 0.012, 0.06
+"""How far flakes fall and the camera drives during an exposure."""
 _GLARE = ((0.004, 0.004, 0.10), (0.014, 0.014, 0.05), (0.07, 0.07, 0.03), (0.06, 0.0016, 0.006))
 """Glare of lens and windscreen: standard deviations across and down, in heights of the picture, and shares; the last
 is the streak of wipers.

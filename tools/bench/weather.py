@@ -27,7 +27,7 @@ from drivesem.config.edits import WEATHER_CODES, FrameEdit
 from drivesem.failures.margins import object_margins
 from drivesem.reporting.drawing import write_picture
 from drivesem.synth import frames as generated
-from drivesem.synth.edits import DRAWN_WEATHER, apply_edit
+from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import SPLITS, Plan, SynthFrame, SynthSettings, Truth
 from scene_ir.derender.derender import VEHICLE_CATEGORIES, derender
 from scene_ir.io import to_uint8
@@ -65,7 +65,7 @@ CODES: dict[str, FrameEdit] = {
         f"{WEATHER_CODES[code]} {amount:g}": FrameEdit(
             weather=tuple(amount * (other == code) for other in Weather)
         )
-        for code in DRAWN_WEATHER
+        for code in Weather
         for amount in (0.5, 1.0)
     },
     "fog and rain 0.5": FrameEdit(weather=tuple(0.5 * (code in (Weather.FOG, Weather.RAIN)) for code in Weather)),

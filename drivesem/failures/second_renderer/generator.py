@@ -18,7 +18,7 @@ from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.errors import UsageError
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.synth.demo import demo_plan
-from drivesem.synth.edits import DRAWN_WEATHER, apply_edit
+from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import (
     GENERATOR_VERSION,
     Plan,
@@ -36,7 +36,7 @@ from drivesem.synth.write import Order, list_jobs, plan_job
 from scene_ir import ffd, files
 from scene_ir.derender.derender import VEHICLE_CATEGORIES
 from scene_ir.errors import FormatError
-from scene_ir.types import LATTICE, SceneIR, Weather
+from scene_ir.types import LATTICE, SceneIR
 
 MANIFEST = "manifest.json"
 _GENERATED_RUN = "a run on generated frames: the embedded scenes, or drivesem synth --layout kitti"
@@ -190,12 +190,9 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
             lamps=max(-1.0, min(lamps, 1.0)),
         )
     environment, then = changed.environment, still.environment
-    weather = (environment.weather - then.weather).detach().clamp(0, 1).tolist()
-    undrawn = [code for code in Weather if code not in DRAWN_WEATHER and weather[code]]
-    missing += [f"{code.name.lower()}: generated streets are drawn without it" for code in undrawn]
     edit = FrameEdit(
         objects=edits,
-        weather=tuple(0.0 if code in undrawn else weather[code] for code in Weather),
+        weather=tuple((environment.weather - then.weather).detach().clamp(0, 1).tolist()),
         foliage=tuple((environment.foliage - then.foliage).detach().clamp(-1, 1).tolist()),
         sun=tuple((environment.light - then.light).detach().clamp(-1, 1).tolist()),
     )

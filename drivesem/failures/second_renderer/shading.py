@@ -169,6 +169,8 @@ def apply_weather(image: Array, depth_m: Array, open_to: Array, environment: Env
         wet += road * np.clip(0.1 + depth / 90, 0, 0.5) * (mirror - wet)
         light = light + rain * (wet - light)
     light = np.clip(light, 0, 1)
+    if snow:
+        light += 0.25 * snow * road * (np.maximum(0.4, light) - light)
     air = mist * air + (1 - mist) * float(air @ _LUMA)
     if rain:
         light += (1 - np.exp(-_RAIN_PER_M * rain * depth)) * (1.15 * air - light)

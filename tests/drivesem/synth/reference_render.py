@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from drivesem.synth.light import LEAF_DEPTH_M, SHADOW_OFFSET_M, SHADOW_OFFSET_TEXELS, develop
-from drivesem.synth.render import SHADOW_TEXELS, grain_number, rasterise, sun_rows, through_lens, with_glare
+from drivesem.synth.render import (
+    SHADOW_TEXELS,
+    grain_number,
+    rasterise,
+    sun_rows,
+    through_lens,
+    with_flakes,
+    with_glare,
+)
 from drivesem.synth.soup import GROUND, Material, Semantic, Soup
 from drivesem.synth.view import (
     SHADOW_VIEWS_M,
@@ -33,7 +41,8 @@ def render(sight: Sight, soup: Soup, shadows: list[Shadow], setting: Setting) ->
     shining = np.zeros_like(image)
     develop_pixels(sight, setting, sun_maps(soup, setting), shadows, (image, np.ones(pixels, bool), shining))
     shape = (camera.height, camera.width, 3)
-    return take(with_glare(image.reshape(shape), shining.reshape(shape), setting), setting)
+    glared = with_glare(image.reshape(shape), shining.reshape(shape), setting)
+    return take(with_flakes(glared, sight.depth_m, setting), setting)
 
 
 def see(soup: Soup, view: View) -> Sight:

@@ -8,7 +8,15 @@ import numpy as np
 
 from drivesem.synth import lamps as lamping
 from drivesem.synth.layout import Road
-from drivesem.synth.light import MIRRORED_GROUND, SOAKED, Light, ground_light
+from drivesem.synth.light import (
+    MIRRORED_GROUND,
+    SLUSH_PATCHES,
+    SLUSH_RGB,
+    SLUSH_SHARE,
+    SOAKED,
+    Light,
+    ground_light,
+)
 from drivesem.synth.soup import GROUND, Material
 from drivesem.synth.view import NoiseSet, Setting
 from tests.drivesem.synth.reference_light import reflected_radiance, sample
@@ -274,7 +282,9 @@ def shade(s: Samples, setting: Setting) -> np.ndarray:
         if len(index):
             some = s.take(index)
             colour = _surface(some, material, road, light, noise, extra)
-            out[index] = _wetted(some, material, colour, light, noise, lamps) if light.wet > 0 else colour
+            colour = _wetted(some, material, colour, light, noise, lamps) if light.wet > 0 else colour
+            snowy = light.snow > 0 and material in GROUND
+            out[index] = _slushed(some, colour, light, noise, extra) if snowy else colour
     distance = np.sqrt(np.einsum("ni,ni->n", s.point, s.point))
     through = np.exp(-light.haze_per_m * distance)[:, None].astype(_F)
     air = light.horizon * 0.6
@@ -367,6 +377,15 @@ def _wetted(
     rough = lamping.WET_ROUGH + (lamping.PUDDLE_ROUGH - lamping.WET_ROUGH) * puddle
     glints = _glints(s, light, lamps, rough, 0.02) * (cover * hidden)[:, None]
     return out * (1 - share)[:, None] + env * (share * hidden)[:, None] + glints
+
+
+def _slushed(
+    s: Samples, bare: np.ndarray, light: Light, noise: NoiseSet, extra: tuple[np.ndarray, float, np.ndarray]
+) -> np.ndarray:
+    """Radiance (n, 3) of ground under patches of slush."""
+    patch = _noise(noise.soft, s.world[:, 0] - 9, s.world[:, 2] * _F(0.5), 0.04)
+    share = _F(light.snow) * np.clip(SLUSH_SHARE + SLUSH_PATCHES * patch, 0, 1)
+    return bare + (_rgb(*SLUSH_RGB) * _irradiance(s, light, extra[0], extra[2]) - bare) * share[:, None]
 
 
 def _dirty(s: Samples, noise: NoiseSet) -> np.ndarray:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from drivesem.synth import edits
 from drivesem.synth.edits import ALL, FrameEdit, ObjectEdit, apply_edit, apply_edits, draw_night, read_edits
 from drivesem.synth.frames import Plan, SynthFrame, SynthSettings, plan_frame, render_frame
 from drivesem.synth.lamps import beam_share
 from drivesem.synth.layout import LayoutSettings, clearance, footprint
+from drivesem.synth.render import with_flakes
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
 from scene_ir.geometry import yaw_matrix
@@ -271,10 +271,30 @@ def test_headlamps_light_what_is_near_and_below_their_cut_off():
     assert aside[4] == 0
 
 
-def test_weather_that_the_generator_does_not_draw_is_one_line(plan, monkeypatch):
-    monkeypatch.setattr(edits, "DRAWN_WEATHER", (Weather.FOG,))
-    with pytest.raises(RangeError, match=r"weather.night: expected 0, since generated streets .* found 1.0"):
-        apply_edit(plan, FrameEdit(weather=NIGHT))
+def test_snow_falls_from_a_closed_sky_and_pales_the_ground(plan):
+    clouds, snow, again = (
+        render_edit(plan, weather=codes) for codes in (weather(overcast=1.0), weather(snow=1.0), weather(snow=1.0))
+    )
+    assert snow.image.tobytes() == again.image.tobytes()
+    assert torch.equal(clouds.labels.boxes_xyxy, snow.labels.boxes_xyxy)
+    assert np.array_equal(clouds.depth_m, snow.depth_m)
+    road = (clouds.environment.road.numpy() > 0.9) & (clouds.depth_m < 15)
+    assert road.sum() > 1000
+    assert snow.image[road].mean() > 1.1 * clouds.image[road].mean()
+
+
+def test_flakes_are_before_what_is_seen_and_bright_in_the_beam_by_night(plan):
+    height, width = plan.setting.view.camera.height, plan.setting.view.camera.width
+    grey = np.full((height, width, 3), 0.1, np.float32)
+    day, night = (
+        apply_edit(plan, FrameEdit(weather=weather(snow=1.0, night=code))).setting for code in (0.0, 1.0)
+    )
+    assert with_flakes(grey, np.full((height, width), np.inf), plan.setting) is grey
+    assert np.array_equal(with_flakes(grey, np.full((height, width), 0.8), day), grey)
+    shares = [(with_flakes(grey, np.full((height, width), d), day) > 0.15).mean() for d in (4.0, 200.0)]
+    assert 0 < shares[0] < shares[1] < 0.1
+    lit = with_flakes(grey, np.full((height, width), np.inf), night) - grey
+    assert lit[height // 2 + 100 :].mean() > 2 * lit[: height // 2].mean() > 0
 
 
 def test_nights_are_drawn_for_a_share_of_streets():

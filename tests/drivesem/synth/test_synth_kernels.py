@@ -108,6 +108,7 @@ WEATHERS = {
     "fog": {"weather": "fog", "haze_per_m": 0.02, "sun_colour": np.full(3, 0.05)},
     "dusk": {"weather": "dusk", "sun": np.array([0.5, -0.15, 0.85])},
     "rain": {"wet": 0.9, "clouds": 1.0},
+    "snow": {"snow": 0.8, "clouds": 1.0},
     "panorama": {"panorama": PANORAMA, "wet": 0.5},
 }
 

@@ -268,15 +268,11 @@ def test_what_has_no_counterpart_is_named_where_it_was_changed(plan: Plan, stree
     found = transfer_edit(street_scene, changed, match_tracks(plan, None, tracks_of(plan)[1], None))
     assert found.missing == ("objects[0]: the generator's plan has no such vehicle",)
     assert list(found.edit.objects) == [tracks_of(plan)[1]]
-    in_snow = street_scene.with_environment(weather=torch.eye(len(Weather))[Weather.SNOW])
-    assert transfer_edit(street_scene, in_snow, match_tracks(plan, *tracks_of(plan))).missing == (
-        "snow: generated streets are drawn without it",
-    )
 
 
-def test_night_and_lamps_are_transferred(plan: Plan, street_scene: SceneIR) -> None:
+def test_night_snow_and_lamps_are_transferred(plan: Plan, street_scene: SceneIR) -> None:
     codes = torch.zeros(len(Weather))
-    codes[Weather.NIGHT] = 0.5
+    codes[Weather.NIGHT], codes[Weather.SNOW] = 0.5, 0.25
     lamps = street_scene.objects.lamps.clone()
     lamps[1] = -0.75
     changed = street_scene.with_objects(lamps=lamps).with_environment(weather=codes)

@@ -10,6 +10,7 @@ import torch
 
 from drivesem.failures.second_renderer.geometry import PictureCamera, VehiclePose
 from drivesem.failures.second_renderer.night import apply_night
+from drivesem.failures.second_renderer.shading import apply_weather
 from scene_ir.types import Environment, Weather
 
 HEIGHT, WIDTH, FOCAL, HORIZON, ABOVE_M = 160, 320, 300.0, 60, 1.5
@@ -159,3 +160,12 @@ def test_small_bright_areas_away_from_the_sky_shine_on() -> None:
         for picture in (np.where(image == np.float32(0.85), 1.0, image).astype(np.float32), image)
     ]
     assert float(high[0][window].mean()) > 2 * float(high[1][window].mean())
+
+
+def test_snow_pales_the_road() -> None:
+    air, show = np.full(3, 0.8, np.float32), np.ones((HEIGHT, WIDTH), np.float32)
+    road, bare = (apply_weather(IMAGE, DEPTH_M, show, surroundings(r, snow=0.8), air) for r in (1.0, 0.0))
+    assert np.array_equal(road[:HORIZON], bare[:HORIZON])
+    assert road[-40:].mean() > bare[-40:].mean() + 0.03
+    without = apply_weather(IMAGE, DEPTH_M, show, surroundings(), air)
+    assert without is IMAGE
