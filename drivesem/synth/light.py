@@ -31,9 +31,9 @@ class Panorama:
 class Light:
     """Light of a frame, in camera axes. sun (3,): towards the sun; up (3,): the ground's normal. Colours (3,) are
     linear radiance or irradiance where sunlit white is about 1. haze_per_m: extinction. clouds: cover in [0, 1].
-    wet, snow: how much water and slush lie on the ground, in [0, 1]; snow falls as densely. panorama: the sky, instead of gradient and clouds. heading:
-    rad that the camera is turned to the right of where clouds, skyline and panorama have azimuth 0. night: share of
-    night in [0, 1], by which windows are lit.
+    wet, snow: how much water and slush lie on the ground, in [0, 1]; snow falls as densely. panorama: the sky, instead
+    of gradient and clouds. heading: rad that the camera is turned to the right of where clouds, skyline and panorama
+    have azimuth 0. night: share of night in [0, 1], by which windows are lit.
     """
 
     weather: str

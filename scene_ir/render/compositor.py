@@ -29,6 +29,7 @@ from scene_ir.render.lamps import draw_lamps
 from scene_ir.render.night import apply_night
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
 from scene_ir.render.reflections import mirror_in_ground
+from scene_ir.render.spray import draw_spray
 from scene_ir.render.texture import PaintRegions
 from scene_ir.types import Crop, Objects, Render, SceneIR, Weather
 
@@ -148,12 +149,14 @@ class Compositor(PreparedScene):
         if weather:
             changed = replace(behind, weather=environment.weather.to(self.like))
             colour, inverse = canvas.split([3, 1])
-            mirrored = None
+            mirrored = spray = None
             if is_active(changed.weather[Weather.RAIN]):
                 values = torch.cat([colour, changed.sky.to(colour)[None]])
                 rise, camera_m = self.night_maps.maps[RISE], self.night_maps.camera_m
                 mirrored = mirror_in_ground(values, inverse[0], changed.road, rise, camera_m)
-            image = apply_weather(colour, inverse[0], changed, self.air, mirrored, backend)
+                if len(objects):
+                    spray = draw_spray(inverse[0], objects, self.lamps, self.scene.camera)
+            image = apply_weather(colour, inverse[0], changed, self.air, mirrored, backend, spray)
             if is_active(changed.weather[Weather.SNOW]):
                 image = add_flakes(image, inverse[0], changed, self.air)
             lit = self.night_maps.maps[LIT]

@@ -168,6 +168,7 @@ def apply_weather(
     air: Tensor,
     mirrored: Tensor | None = None,
     backend: Backend = "reference",
+    spray: Tensor | None = None,
 ) -> Tensor:
     """The picture (3, H, W) under `environment.weather`: fog, rain, time of day, overcast, and the haze, clouds and
     slush of snow. Its flakes are `add_flakes`, night is `night.apply_night`.
@@ -182,13 +183,15 @@ def apply_weather(
         air: (3,) RGB of the airlight.
         mirrored: (4, H, W), picture and sky as of `reflections.mirror_in_ground`; None where no road is wet.
         backend: Implementation.
+        spray: (H, W), of `spray.draw_spray`; None where there is none.
     """
     weather, snow = _daylight_codes(environment.weather.to(image)), environment.weather[Weather.SNOW].to(image)
     if snow.requires_grad or bool(snow.detach() != 0):
         slush = by_row(model.SLUSH * snow, image.shape[1]) * environment.road.to(image)
         image = image + slush * (model.SLUSH_LIGHT - image)
     streaks = _rain_streaks(*environment.sky.shape).to(image)
-    inputs = (image, inverse_depth, weather, air, environment, mirrored, streaks)
+    drops = streaks if spray is None else streaks + spray
+    inputs = (image, inverse_depth, weather, air, environment, mirrored, drops)
     if backend == "warp":
         from scene_ir.render.kernels import effects
 
@@ -235,7 +238,7 @@ def _apply_daylight(
     air: Tensor,
     environment: Environment,
     mirrored: Tensor | None,
-    streaks: Tensor,
+    drops: Tensor,
 ) -> Tensor:
     """Fog, rain, time of day and overcast.
 
@@ -243,7 +246,7 @@ def _apply_daylight(
         image, inverse_depth, air, mirrored: As of `apply_weather`.
         weather: (5,) of `_daylight_codes`.
         environment: Maps of sky and road, ground.
-        streaks: (H, W) of `_rain_streaks`.
+        drops: (H, W), opacity of rain 1 that is near: streaks and spray.
     """
     fog, rain, _, _, _ = weather
     depth = 1.0 / inverse_depth.clamp(min=1.0 / model.HAZE_CAP_M)
@@ -258,7 +261,7 @@ def _apply_daylight(
         image = image + wet * ((model.WET_ROAD - 1.0) * image + share * sheen)
     veil = -torch.expm1(-model.RAIN_EXTINCTION_PER_M * rain * depth)
     image = apply_veil(image, veil, model.RAIN_AIR * mist)
-    image = image + model.STREAKS * rain * streaks * (mist - image)
+    image = image + rain * drops * (mist - image)
     # Fog (Koschmieder 1924).
     return apply_veil(image, -torch.expm1(-model.FOG_EXTINCTION_PER_M * fog * depth), mist)
 
@@ -299,7 +302,7 @@ def apply_veil(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _rain_streaks(height: int, width: int) -> Tensor:
-    """Rain streaks (H, W) in [0, 1]: sparse drops drawn out along a slight slant; constant per frame size."""
+    """Opacity (H, W) of the streaks of rain 1: sparse drops drawn out along a slight slant; constant per frame size."""
     generator = torch.Generator().manual_seed(20190416)
     drops = (torch.rand(height, width, generator=generator) > 0.9965).float()
     length = max(5, height // 24)
@@ -308,7 +311,7 @@ def _rain_streaks(height: int, width: int) -> Tensor:
     kernel[rows, (length // 2 + (rows - length // 2) * 0.18).round().long()] = torch.hann_window(length + 2)[1:-1]
     padded = torch.nn.functional.pad(drops[None, None], (length // 2, (length - 1) // 2) * 2)
     streaks = torch.nn.functional.conv2d(padded, kernel[None, None])
-    return kornia.filters.gaussian_blur2d(streaks, (3, 3), (0.6, 0.6))[0, 0].clamp(0.0, 1.0)
+    return kornia.filters.gaussian_blur2d(streaks, (3, 3), (0.6, 0.6))[0, 0].clamp(0.0, 1.0) * model.STREAKS
 
 
 @lru_cache(maxsize=8)

@@ -225,6 +225,14 @@ RAIN_AIR = 1.15
 """Brightness of that haze, relative to the airlight."""
 STREAKS = 0.06
 """Opacity of the streaks of rain 1."""
+SPRAY_PER_M, SPRAY_BEHIND, SPRAY_SIZE = 0.10, 0.3, (1.0, 0.28, 0.36)
+"""Spray of vehicles: extinction in its middle at rain 1; distance of that behind the vehicle's end, in its widths;
+standard deviations along, up and across, in widths, heights and widths of the vehicle.
+"""
+SPRAY_REACH, SPRAY_NEAR_M, SPRAY_LOGIT = 3.0, (3.0, 7.0), 1.7
+"""Standard deviations beyond which there is none; depth of its middle from which it is drawn, and fully; slope of the
+logistic function that stands for the normal distribution.
+"""
 SNOW_FOG, SNOW_COVER = 0.08, 0.9
 """Haze and clouds of snow 1, as codes of fog and overcast."""
 SLUSH, SLUSH_LIGHT = 0.18, 0.80

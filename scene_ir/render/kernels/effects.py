@@ -199,12 +199,12 @@ def _apply_veil_adjoint(x: wp.vec3f, veil: wp.float32, air: wp.vec3f, g: wp.vec3
 
 
 @wp.func
-def _apply_haze(x: wp.vec3f, depth: wp.float32, streak: wp.float32, settings: Floats):
+def _apply_haze(x: wp.vec3f, depth: wp.float32, drops: wp.float32, settings: Floats):
     """A pixel after haze, streaks and fog."""
     rain = load(settings, WET)
     air = load3(settings, AIR, 1)
     far = _apply_veil(x, 1.0 - exp_(-RAIN * rain * depth), model.RAIN_AIR * air)
-    streaked = far + (model.STREAKS * rain * streak) * (air - far)
+    streaked = far + (rain * drops) * (air - far)
     return _apply_veil(streaked, 1.0 - exp_(-FOG * load(settings, MIST) * depth), air)
 
 
@@ -221,13 +221,13 @@ def _dry_kernel(
     image: Floats,
     inverse: Floats,
     sky: Floats,
-    streaks: Floats,
+    drops: Floats,
     plane: int,
     out: Floats,
 ):
     i = start + wp.tid()
     x = _dampen(load3(image, i, plane), load(sky, i), settings)
-    store3(out, i, plane, _apply_haze(x, _haze_depth(load(inverse, i)), load(streaks, i), settings))
+    store3(out, i, plane, _apply_haze(x, _haze_depth(load(inverse, i)), load(drops, i), settings))
 
 
 @wp.kernel
@@ -237,7 +237,7 @@ def _wet_kernel(
     image: Floats,
     inverse: Floats,
     sky: Floats,
-    streaks: Floats,
+    drops: Floats,
     plane: int,
     road: Floats,
     mirrored: Floats,
@@ -250,7 +250,7 @@ def _wet_kernel(
     share, _slope = _mirror_share(depth, settings)
     change = WET_CHANGE * x + share * _sheen(x, mirror, settings)
     wetted = x + (load(settings, WET) * load(road, i)) * change
-    store3(out, i, plane, _apply_haze(wetted, depth, load(streaks, i), settings))
+    store3(out, i, plane, _apply_haze(wetted, depth, load(drops, i), settings))
 
 
 @wp.func
@@ -283,11 +283,11 @@ def _haze_adjoint(
     mirrored: wp.vec3f,
     road: wp.float32,
     inverse: wp.float32,
-    streak: wp.float32,
+    drops: wp.float32,
     g: wp.vec3f,
     settings: Floats,
 ):
-    """Gradients of the wet road and `_apply_haze` to x, mirrored, fog, the other codes (4), inverse, road."""
+    """Gradients of the wet road and `_apply_haze` to x, mirrored, fog, the other codes (4), inverse, road, drops."""
     rain = load(settings, WET)
     fog = load(settings, MIST)
     air = load3(settings, AIR, 1)
@@ -300,26 +300,23 @@ def _haze_adjoint(
     clear = exp_(-RAIN * rain * depth)
     haze = model.RAIN_AIR * air
     far = _apply_veil(wetted, 1.0 - clear, haze)
-    streaked = far + (model.STREAKS * rain * streak) * (air - far)
+    streaked = far + (rain * drops) * (air - far)
     visible = exp_(-FOG * fog * depth)
 
     g_far, g_fog, g_fog_air = _apply_veil_adjoint(streaked, 1.0 - visible, air, g)
     g_fogged = FOG * visible * g_fog
-    g_streak = wp.dot(g_far, air - far)
-    g_haze = (1.0 - model.STREAKS * rain * streak) * g_far
+    g_drops = wp.dot(g_far, air - far)
+    g_haze = (1.0 - rain * drops) * g_far
     g_wet, g_veil, g_haze_air = _apply_veil_adjoint(wetted, 1.0 - clear, haze, g_haze)
     g_hazed = RAIN * clear * g_veil
     g_change = wp.dot(g_wet, change)
     g_air = (
-        g_fog_air
-        + (model.STREAKS * rain * streak) * g_far
-        + model.RAIN_AIR * g_haze_air
-        + (model.SHEEN_AIR * wet * share) * g_wet
+        g_fog_air + (rain * drops) * g_far + model.RAIN_AIR * g_haze_air + (model.SHEEN_AIR * wet * share) * g_wet
     )
     g_grey = wp.dot(g_air, load3(settings, AIR_BY_HAZE, 1))
     to_fog = g_fogged * depth + (1.0 - rain) * g_grey
     codes = wp.vec4f(
-        g_hazed * depth + model.STREAKS * streak * g_streak + road * g_change + (1.0 - fog) * g_grey,
+        g_hazed * depth + drops * g_drops + road * g_change + (1.0 - fog) * g_grey,
         wp.dot(g_air, load3(settings, AIR_BY_TIME, 1)),
         wp.dot(g_air, load3(settings, AIR_BY_OVERCAST, 1)),
         wp.dot(g_air, load3(settings, AIR_BY_SUN, 1)),
@@ -327,7 +324,15 @@ def _haze_adjoint(
     g_depth = g_fogged * fog + g_hazed * rain + wet * slope * wp.dot(g_wet, sheen)
     g_inverse = wp.where(inverse >= NEAREST, -(depth * depth) * g_depth, 0.0)
     g_x = (1.0 + wet * (WET_CHANGE - WET_ROAD * share)) * g_wet
-    return g_x, (model.SHEEN_MIRROR * wet * share) * g_wet, to_fog, codes, g_inverse, rain * g_change
+    return (
+        g_x,
+        (model.SHEEN_MIRROR * wet * share) * g_wet,
+        to_fog,
+        codes,
+        g_inverse,
+        rain * g_change,
+        rain * g_drops,
+    )
 
 
 @wp.func
@@ -344,7 +349,7 @@ def _dry_adjoint_kernel(
     image: Floats,
     inverse: Floats,
     sky: Floats,
-    streaks: Floats,
+    drops: Floats,
     plane: int,
     grad: Floats,
     grad_image: Floats,
@@ -352,15 +357,15 @@ def _dry_adjoint_kernel(
     code_parts: Floats,
     grad_maps: Floats,
 ):
-    """code_parts: each pixel's part of the gradients to the `CODES`, one plane each; grad_maps: to sky and road,
-    likewise.
+    """code_parts: each pixel's part of the gradients to the `CODES`, one plane each; grad_maps: to sky, road
+    and drops, likewise.
     """
     i = start + wp.tid()
     colour = load3(image, i, plane)
     sky_share = load(sky, i)
     x = _dampen(colour, sky_share, settings)
-    g, _mirrored, to_fog, codes, g_inverse, _road = _haze_adjoint(
-        x, x, 0.0, load(inverse, i), load(streaks, i), load3(grad, i, plane), settings
+    g, _mirrored, to_fog, codes, g_inverse, _road, g_drops = _haze_adjoint(
+        x, x, 0.0, load(inverse, i), load(drops, i), load3(grad, i, plane), settings
     )
     g_colour, parts, g_sky = _dampen_adjoint(colour, sky_share, g, settings)
     store3(grad_image, i, plane, g_colour)
@@ -369,6 +374,7 @@ def _dry_adjoint_kernel(
     _store4(code_parts, i + plane, plane, codes + parts)
     store(grad_maps, i, g_sky)
     store(grad_maps, i + plane, 0.0)
+    store(grad_maps, i + 2 * plane, g_drops)
 
 
 @wp.kernel
@@ -378,7 +384,7 @@ def _wet_adjoint_kernel(
     image: Floats,
     inverse: Floats,
     sky: Floats,
-    streaks: Floats,
+    drops: Floats,
     plane: int,
     grad: Floats,
     road: Floats,
@@ -394,12 +400,12 @@ def _wet_adjoint_kernel(
     sky_share = load(sky, i)
     mirror_colour = load3(mirrored, i, plane)
     mirror_sky = load(mirrored, i + 3 * plane)
-    g, g_mirror, to_fog, codes, g_inverse, g_road = _haze_adjoint(
+    g, g_mirror, to_fog, codes, g_inverse, g_road, g_drops = _haze_adjoint(
         _dampen(colour, sky_share, settings),
         _dampen(mirror_colour, mirror_sky, settings),
         load(road, i),
         load(inverse, i),
-        load(streaks, i),
+        load(drops, i),
         load3(grad, i, plane),
         settings,
     )
@@ -413,6 +419,7 @@ def _wet_adjoint_kernel(
     _store4(code_parts, i + plane, plane, codes + parts + mirror_parts)
     store(grad_maps, i, g_sky)
     store(grad_maps, i + plane, g_road)
+    store(grad_maps, i + 2 * plane, g_drops)
 
 
 def _rows(values: Tensor, above: float) -> tuple[int, int]:
@@ -444,7 +451,7 @@ _scratch = _ScratchMemory()
 
 
 class _Weather(torch.autograd.Function):
-    """Weather over image (3, H, W) at inverse depth (H, W); code (5,), air (3,), camera (1,); sky, road, streaks
+    """Weather over image (3, H, W) at inverse depth (H, W); code (5,), air (3,), camera (1,); sky, road, drops
     (H, W); mirrored (4, H, W) or None.
     """
 
@@ -458,7 +465,7 @@ class _Weather(torch.autograd.Function):
         camera: Tensor,
         sky: Tensor,
         road: Tensor,
-        streaks: Tensor,
+        drops: Tensor,
         mirrored: Tensor | None,
     ) -> Tensor:
         height, width = image.shape[1:]
@@ -467,7 +474,7 @@ class _Weather(torch.autograd.Function):
             top, bottom, mirrored = 0, 0, image.new_empty(0)
         else:  # finding the road would make the CPU wait for a GPU
             top, bottom = (0, height) if road.is_cuda else _rows(road, 0.0)
-        saved = [t.detach().contiguous() for t in (image, inverse, sky, streaks, road, mirrored)]
+        saved = [t.detach().contiguous() for t in (image, inverse, sky, drops, road, mirrored)]
         settings_in = flat_array(settings)
         constants = [flat_array(t) for t in (code, air, camera)]
         launch(_settings_kernel, [0, 3], [*constants, settings_in])
@@ -490,7 +497,7 @@ class _Weather(torch.autograd.Function):
         height, width = inverse.shape
         plane = height * width
         grad_image, grad_inverse = torch.empty_like(image), torch.empty_like(inverse)
-        grad_maps, grad_mirrored = image.new_empty(2, height, width), torch.zeros_like(mirrored)
+        grad_maps, grad_mirrored = image.new_empty(3, height, width), torch.zeros_like(mirrored)
         parts = _scratch.planes(image, CODES * plane)[0]
         inputs = [settings_in, *inputs, plane, flat_array(grad.contiguous())]
         outputs = [flat_array(t) for t in (grad_image, grad_inverse, parts, grad_maps)]
@@ -500,7 +507,7 @@ class _Weather(torch.autograd.Function):
         launch(_wet_adjoint_kernel, _ranges(top * width, bottom * width), [*inputs, *through, *outputs])
         grad_code = _sum_rows_first(parts.view(CODES, height, width))
         to_mirrored = grad_mirrored if mirrored.numel() else None
-        return grad_image, grad_inverse, grad_code, None, None, *grad_maps, None, to_mirrored
+        return grad_image, grad_inverse, grad_code, None, None, *grad_maps, to_mirrored
 
 
 def _sum_rows_first(code_parts: Tensor) -> Tensor:
@@ -751,12 +758,12 @@ def apply_weather(
     air: Tensor,
     environment: Environment,
     mirrored: Tensor | None,
-    streaks: Tensor,
+    drops: Tensor,
 ) -> Tensor:
     """See `environment.apply_weather`; float32, the airlight constant."""
     sky, road, ground = (getattr(environment, name).to(image) for name in ("sky", "road", "ground"))
     return _Weather.apply(
-        image, inverse, weather, air.to(image).detach(), ground[3:].detach(), sky, road, streaks, mirrored
+        image, inverse, weather, air.to(image).detach(), ground[3:].detach(), sky, road, drops, mirrored
     )
 
 

@@ -63,10 +63,11 @@ def _run(name: str, code: list[float], frame: tuple[int, int, int], backend: str
     scenery = replace(scenery, weather=scenery.weather.to(dtype), **maps)
     if name == "weather":
         # How much of sky and road shows, as of what cars hide; what a wet road mirrors.
-        live += [torch.ones_like(maps["sky"]), _mirrored(*frame).to(dtype)]
+        spray = _mirrored(*frame)[0] * 0.5
+        live += [torch.ones_like(maps["sky"]), _mirrored(*frame).to(dtype), spray.to(dtype)]
         live[3:] = [t.requires_grad_() for t in live[3:]]
         changed = replace(scenery, weather=live[1], sky=live[3] * maps["sky"], road=live[3] * maps["road"])
-        out = env.apply_weather(live[0], live[2], changed, air.to(dtype), live[4], backend)  # type: ignore[arg-type]
+        out = env.apply_weather(live[0], live[2], changed, air.to(dtype), live[4], backend, live[5])  # type: ignore[arg-type]
     else:
         live.pop()
         changed = replace(scenery, foliage=live[1])
@@ -134,6 +135,7 @@ def test_two_pictures_can_await_their_gradients() -> None:
             air.float(),
             _mirrored(40, 60, 10).float(),
             "warp",
+            0.5 * _mirrored(40, 60, 10)[0].float(),
         )
         for c in (code, other)
     ]
