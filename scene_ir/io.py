@@ -79,6 +79,8 @@ _LABEL_FIELDS: dict[str, tuple[int, ...]] = {
     "size_lhw": (3,),
 }
 _ENVIRONMENT_FIELDS = {"weather": WEATHER_DIM, "foliage": FOLIAGE_DIM, "light": LIGHT_DIM, "sun": 3, "ground": 4}
+_DROPS = "drops"
+"""Of the environment; scenes saved before there were any have none."""
 _SOURCE_FIELDS: dict[str, tuple[int, ...]] = {
     "translation": (3,),
     "yaw": (),
@@ -147,7 +149,9 @@ def save_scene(scene: SceneIR, folder: Path, lossy: bool = False) -> None:
             "objects": {name: _numbers(getattr(scene.objects, name)) for name in _OBJECT_FIELDS},
             "sources": [_source_record(i, source, arrays) for i, source in enumerate(scene.objects.source)],
             "front": [_occluder_record(i, occluder, arrays) for i, occluder in enumerate(scene.occluders)],
-            "environment": {name: _numbers(getattr(scene.environment, name)) for name in _ENVIRONMENT_FIELDS},
+            "environment": {
+                name: _numbers(getattr(scene.environment, name)) for name in (*_ENVIRONMENT_FIELDS, _DROPS)
+            },
             "ignore": _numbers(scene.ignore),
             "others": None if scene.other_labels is None else _labels_record(scene.other_labels),
             "before": scene.before is not None,
@@ -209,6 +213,7 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
             **{name: arrays.tensor(name, *size) for name in _MAPS},
             closed_sky=arrays.tensor(_CLOSED_SKY, 2, 3, None, None) if _CLOSED_SKY in arrays else None,
             ego=arrays.tensor("ego", *size) if "ego" in arrays else None,
+            drops=environment_node[_DROPS].tensor(1) if _DROPS in environment_node.mapping() else torch.zeros(1),
         )
     )
     meshes = tuple(_load_mesh(folder / "meshes" / f"{i}.glb") for i in range(root["meshes"].integer()))

@@ -331,6 +331,8 @@ class Environment:
     ego: Tensor | None = None
     """(H, W) in [0, 1], opacity of the ego vehicle (bonnet, dashboard), which no code changes; None if the photograph
     does not show it."""
+    drops: Tensor = field(default_factory=lambda: torch.zeros(1))
+    """(1,) in [0, 1], drops of rain on the windscreen; 0 is as photographed. No attack moves it."""
 
     def __post_init__(self) -> None:
         if isinstance(self.weather, Tensor) and self.weather.shape in [(n,) for n in PAST_WEATHER_DIMS]:
@@ -339,6 +341,7 @@ class Environment:
         check_shape("environment.weather", self.weather, WEATHER_DIM)
         check_shape("environment.foliage", self.foliage, FOLIAGE_DIM)
         check_shape("environment.light", self.light, LIGHT_DIM)
+        check_shape("environment.drops", self.drops, 1)
         check_shape("environment.sun", self.sun, 3)
         check_shape("environment.ground", self.ground, 4)
         check_shape("environment.sky", self.sky, None, None)
@@ -348,7 +351,7 @@ class Environment:
             check_shape("environment.closed_sky", self.closed_sky, 2, 3, None, None)
         if self.ego is not None:
             check_shape("environment.ego", self.ego, *self.sky.shape)
-        for name in ("weather", "foliage", "light", "sun", "ground"):
+        for name in ("weather", "foliage", "light", "drops", "sun", "ground"):
             check_finite(f"environment.{name}", getattr(self, name))
 
 
@@ -458,6 +461,7 @@ class SceneIR:
             weather=torch.zeros_like(self.environment.weather),
             foliage=torch.zeros_like(self.environment.foliage),
             light=torch.zeros_like(self.environment.light),
+            drops=torch.zeros_like(self.environment.drops),
         )
         return replace(self, objects=objects, environment=environment)
 

@@ -111,6 +111,7 @@ def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) 
         weather=weather.clamp(0.0, limits.weather),
         foliage=foliage.clamp(-limits.foliage, limits.foliage),
         light=(environment.light + environment.light.new_tensor(edit.sun)).clamp(-1.0, 1.0),
+        drops=(environment.drops + edit.drops).clamp(0.0, 1.0),
     )
 
 

@@ -5,6 +5,7 @@ An edit of one frame, as YAML or as nested mappings:
     weather: {fog: 0.5}             # codes in [0, 1]: fog, rain, time, overcast, night, snow; or a name, such as sunset
     foliage: {hue: 0.4}             # codes in [-1, 1]: hue, lightness, density
     sun: {azimuth: -0.5}            # codes in [-1, 1]: azimuth, elevation, strength
+    drops: 0.5                      # drops on the windscreen, in [0, 1]
     objects:
       2: {translate: [0.5m, 0m], rotate: 10deg}
       4: {color: [0.3, 0, -0.5, 0, 0], mesh: [...]}   # as theta has them: 5 codes, 96 lattice offsets
@@ -17,7 +18,7 @@ An edit of one frame, as YAML or as nested mappings:
 translate is along the vehicle's length and across to its left (+z of its own axes), on the ground; rotate is about
 its ground centre. Text needs a unit: m, deg, rad or %. A bare number of a YAML file is in theta's units: own
 lengths, rad, shares. On the command line everything is text: `objects[2].translate=0.5m,0m`, `weather=fog`,
-`weather=fog=0.6,night=1`, `weather.rain=0.4`.
+`weather=fog=0.6,night=1`, `weather.rain=0.4`, `drops=0.5`.
 """
 
 from __future__ import annotations
@@ -51,13 +52,13 @@ WEATHER_PRESETS: Mapping[str, Mapping[str, float]] = {
 OBJECT_KEYS = ("translate", "rotate", "color", "mesh", "size", "lamps", "remove")
 LAMPS: Mapping[str, float] = {"off": -1.0, "auto": 0.0, "brake": 1.0}
 """Codes of lamps by name."""
-FRAME_KEYS = ("objects", "weather", "foliage", "sun")
+FRAME_KEYS = ("objects", "weather", "foliage", "sun", "drops")
 LENGTH_UNITS = {"m": 1.0}
 ANGLE_UNITS = {"deg": math.pi / 180, "rad": 1.0}
 FRACTION_UNITS = {"%": 0.01}
 MAX_SIZE_CHANGE = 0.5
 """Largest growth or shrinkage of a vehicle, as a fraction."""
-_PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather)|(weather|foliage|sun)\.(\w+)")
+_PLACE = re.compile(r"objects\[([^\]]*)\]\.(\w+)|(weather|drops)|(weather|foliage|sun)\.(\w+)")
 _BOOLEANS = {"true": True, "false": False}
 
 
@@ -109,6 +110,8 @@ class FrameEdit:
     """Foliage codes (3,), in [-1, 1]."""
     sun: tuple[float, ...] = (0.0,) * len(SUN_CODES)
     """Sun codes (3,), in [-1, 1]."""
+    drops: float = 0.0
+    """Drops on the windscreen, in [0, 1]."""
 
 
 Edits = Mapping[int | str, FrameEdit]
@@ -146,13 +149,13 @@ def parse_setting(text: str, setting: str = "--set") -> dict[str, Any]:
     if not equals or not value or match is None:
         raise FormatError(
             f"{setting} {text}",
-            f"objects[N].{'|'.join(OBJECT_KEYS)}=..., weather[.CODE]=..., foliage.CODE=... or sun.CODE=...",
+            f"objects[N].{'|'.join(OBJECT_KEYS)}=..., weather[.CODE]=..., foliage.CODE=..., sun.CODE=... or drops=...",
             "no value" if match is not None else "an unknown parameter",
         )
-    row, parameter, weather, environment, code = match.groups()
+    row, parameter, whole, environment, code = match.groups()
     change: dict[str, Any]
-    if weather is not None:
-        change = {weather: value}
+    if whole is not None:
+        change = {whole: value}
     elif environment is not None:
         change = {environment: {code: value}}
     else:
@@ -209,6 +212,7 @@ def parse_frame_edit(where: str, value: Any) -> FrameEdit:
         weather=_codes(f"{where}: weather", weather, WEATHER_CODES, 0.0),
         foliage=_codes(f"{where}: foliage", entry.get("foliage"), FOLIAGE_CODES, -1.0),
         sun=_codes(f"{where}: sun", entry.get("sun"), SUN_CODES, -1.0),
+        drops=_code(f"{where}: drops", entry.get("drops", 0.0), 0.0),
     )
 
 
@@ -334,8 +338,11 @@ def _number_or_all(where: str, key: Any) -> int | str:
 
 def _codes(where: str, value: Any, names: tuple[str, ...], low: float) -> tuple[float, ...]:
     entry = require_mapping(where, {} if value is None else value, names)
-    codes = tuple(parse_finite_number(f"{where}.{name}", entry.get(name, 0.0)) for name in names)
-    for name, code in zip(names, codes, strict=True):
-        if not low <= code <= 1:
-            raise FormatError(f"{where}.{name}", f"a code in [{low:g}, 1]", code)
-    return codes
+    return tuple(_code(f"{where}.{name}", entry.get(name, 0.0), low) for name in names)
+
+
+def _code(where: str, value: Any, low: float) -> float:
+    code = parse_finite_number(where, value)
+    if not low <= code <= 1:
+        raise FormatError(where, f"a code in [{low:g}, 1]", code)
+    return code

@@ -76,7 +76,9 @@ def draw_night(plan: Plan, share: float) -> Plan:
 
 
 def apply_edit(plan: Plan, edit: FrameEdit, where: str = "edit") -> Plan:
-    """The plan after one edit. Raises RangeError where it names a track that the plan does not have."""
+    """The plan after one edit. Raises RangeError for drops, and for a track that the plan does not have."""
+    if edit.drops:
+        raise RangeError(f"{where}: drops", "0: generated streets have no windscreen", edit.drops)
     known = {actor.track for actor in plan.actors}
     for track in edit.objects:
         if track != ALL and track not in known:

@@ -31,6 +31,7 @@ from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings,
 from scene_ir.render.reflections import mirror_in_ground
 from scene_ir.render.spray import draw_spray
 from scene_ir.render.texture import PaintRegions
+from scene_ir.render.windscreen import add_drops
 from scene_ir.types import Crop, Objects, Render, SceneIR, Weather
 
 
@@ -92,7 +93,7 @@ class Compositor(PreparedScene):
         """
         environment, backend = perturbed.environment, self.backend
         weather = is_active(environment.weather) or is_active(objects.lamps)
-        foliage = is_active(environment.foliage)
+        foliage, drops = is_active(environment.foliage), is_active(environment.drops)
         canvas = self.canvas if weather else self.canvas[:3]
         if foliage:
             changed = replace(self.scene.environment, foliage=environment.foliage.to(self.like))
@@ -104,7 +105,7 @@ class Compositor(PreparedScene):
         if self.occluders is not None:
             changed = foliage or closed_sky is not None
             layers = self.occluders.append_to(layers, canvas[:3] - self.canvas[:3] if changed else None)
-        drawn = None if weather or foliage else torch.zeros(0, 4, dtype=torch.int64)
+        drawn = None if weather or foliage or drops else torch.zeros(0, 4, dtype=torch.int64)
         behind = self.scene.environment
         shows: Tensor | None = None
         if layers is None:
@@ -167,6 +168,8 @@ class Compositor(PreparedScene):
             image = apply_night(image, inverse[0], changed, lit, lamps, self.night_maps, backend)
         if weather or layers is None:
             image = blend.clamp_colour(image[:3])
+        if drops:
+            image = add_drops(image, environment.drops[0].to(self.like))
         if self.scene.environment.ego is not None:  # at 1, `lerp` takes the photograph to the bit
             ego = self.scene.environment.ego.to(self.like)
             image = torch.lerp(image, self.scene.photograph, ego)

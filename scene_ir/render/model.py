@@ -233,6 +233,15 @@ SPRAY_REACH, SPRAY_NEAR_M, SPRAY_LOGIT = 3.0, (3.0, 7.0), 1.7
 """Standard deviations beyond which there is none; depth of its middle from which it is drawn, and fully; slope of the
 logistic function that stands for the normal distribution.
 """
+DROPS, DROP_RADII, DROP_HANGS = 70, (0.006, 0.024), 0.15
+"""Drops on the windscreen at amount 1, their least and largest radius in heights of the picture, and how much wider
+they are below.
+"""
+DROP_FIELD, DROP_ROWS, DROP_EDGE, DROP_GROWS = 0.16, 40, 0.5, 0.1
+"""What a drop shows: distance from its middle per radius, in heights of the picture, in its middle, and twice as much
+at its edge; rows of that picture, which is out of focus; width of the soft edge, in radii; amount over which a drop
+appears.
+"""
 SNOW_FOG, SNOW_COVER = 0.08, 0.9
 """Haze and clouds of snow 1, as codes of fog and overcast."""
 SLUSH, SLUSH_LIGHT = 0.18, 0.80

@@ -190,6 +190,8 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
             lamps=max(-1.0, min(lamps, 1.0)),
         )
     environment, then = changed.environment, still.environment
+    if bool(environment.drops.any()):
+        missing.append("drops: generated streets have no windscreen")
     edit = FrameEdit(
         objects=edits,
         weather=tuple((environment.weather - then.weather).detach().clamp(0, 1).tolist()),

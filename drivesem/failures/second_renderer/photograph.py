@@ -97,9 +97,10 @@ class PhotographRenderer:
         self._ignore = self._too_hard(to_numpy(still.objects.box2d), to_numpy(still.objects.truncation), rest)
 
     def unsupported_changes(self, changed: SceneIR) -> tuple[str, ...]:
-        """List changes of the sun: textures baked from the photograph keep its light."""
+        """List changes of the sun, as textures baked from the photograph keep its light, and drops on the glass."""
         moved = not torch.equal(changed.environment.light, self._still.environment.light)
-        return ("the sun: its light is baked into the textures",) if moved else ()
+        sun = ("the sun: its light is baked into the textures",) if moved else ()
+        return (*sun, "drops: there is no windscreen") if bool(changed.environment.drops.any()) else sun
 
     @torch.no_grad()
     def render(self, changed: SceneIR) -> SecondRender:

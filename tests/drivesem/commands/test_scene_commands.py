@@ -285,6 +285,18 @@ def test_saved_edits_are_in_physical_units(demo: Path, tmp_path: Path) -> None:
     assert read_frame_edit(path)["objects"][1] == {"remove": True}
 
 
+def test_drops_on_the_windscreen_are_saved_and_add_up(demo: Path, tmp_path: Path) -> None:
+    first, again = tmp_path / "first", tmp_path / "again.png"
+    run_json("edit", demo, "--set", "drops=0.5", "--save", first)
+    assert load_scene(first).environment.drops.tolist() == [0.5]
+    assert load_scene(first).unperturbed().environment.drops.tolist() == [0.0]
+    run_json("edit", first, "--set", "drops=0.5", "-o", again)
+    changed = (files.read_image(again) != files.read_image(demo / "photograph.png")).any(axis=2)
+    assert 0.001 < changed.mean() < 0.06
+    refused = invoke("edit", demo, "--set", "drops=2")
+    assert "drops: expected a code in [0, 1], found 2.0" in refused.err
+
+
 def test_an_edit_begins_with_the_photograph_again(demo: Path, tmp_path: Path) -> None:
     still, changed = tmp_path / "still.png", tmp_path / "S"
     words = ["edit", str(demo), "--set", "objects[0].rotate=10deg", "--set", "weather.fog=0.5"]
