@@ -192,7 +192,7 @@ def test_a_bad_setting_is_one_line_that_repeats_it(text: str, message: str) -> N
     ("text", "message"),
     [
         ("objects: [1]", "objects: expected a mapping, found list"),
-        ("frames: {}", "frames: expected one of objects, weather, foliage, sun, found an unknown key"),
+        ("frames: {}", "frames: expected one of objects, weather, foliage, sun, drops, found an unknown key"),
         ("objects: {1: {rotate: '10'}}", "object 1: rotate: expected a unit"),
         ("- 1", "expected a mapping, found list"),
         ("{", "expected YAML"),
