@@ -293,7 +293,7 @@ def test_drops_on_the_windscreen_are_saved_and_add_up(demo: Path, tmp_path: Path
     run_json("edit", first, "--set", "drops=0.5", "-o", again)
     changed = (files.read_image(again) != files.read_image(demo / "photograph.png")).any(axis=2)
     assert 0.001 < changed.mean() < 0.06
-    refused = invoke("edit", demo, "--set", "drops=2")
+    refused = invoke("edit", demo, "--set", "drops=2", code=2)
     assert "drops: expected a code in [0, 1], found 2.0" in refused.err
 
 
