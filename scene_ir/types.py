@@ -329,8 +329,8 @@ class Environment:
     """(2, 3, h, w) in [0, 1], background and photograph under a closed sky, as codes of the ratio to what they are:
     exp((2 code - 1) `render.model.CLOSED_SKY_LOG`); the second is for the vehicles. None for what is not known."""
     ego: Tensor | None = None
-    """(H, W) in [0, 1], opacity of the ego vehicle (bonnet, dashboard), which no code changes; None if the photograph
-    does not show it."""
+    """(H, W) in [0, 1], opacity of the ego vehicle (bonnet, dashboard), which no code changes but night; None if the
+    photograph does not show it."""
     drops: Tensor = field(default_factory=lambda: torch.zeros(1))
     """(1,) in [0, 1], drops of rain on the windscreen; 0 is as photographed. No attack moves it."""
 

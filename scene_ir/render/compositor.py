@@ -15,7 +15,7 @@ from torch import Tensor
 
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.raster.layout import PixelLayout
-from scene_ir.render import blend, fast, reference
+from scene_ir.render import blend, fast, model, reference
 from scene_ir.render.channels import LIT, RISE
 from scene_ir.render.environment import (
     PerturbedSun,
@@ -26,9 +26,9 @@ from scene_ir.render.environment import (
     sunlight_share,
 )
 from scene_ir.render.lamps import draw_lamps
-from scene_ir.render.night import apply_night
+from scene_ir.render.night import apply_night, night_share
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
-from scene_ir.render.reflections import mirror_in_ground
+from scene_ir.render.reflections import by_row, mirror_in_ground
 from scene_ir.render.spray import draw_spray
 from scene_ir.render.texture import PaintRegions
 from scene_ir.render.windscreen import add_drops
@@ -171,8 +171,11 @@ class Compositor(PreparedScene):
         if drops:
             image = add_drops(image, environment.drops[0].to(self.like))
         if self.scene.environment.ego is not None:  # at 1, `lerp` takes the photograph to the bit
-            ego = self.scene.environment.ego.to(self.like)
-            image = torch.lerp(image, self.scene.photograph, ego)
+            ego, photograph = self.scene.environment.ego.to(self.like), self.scene.photograph
+            if is_active(environment.weather[Weather.NIGHT]):
+                share = night_share(environment.weather.to(self.like), self.night_maps)
+                photograph = photograph * (1.0 - by_row(model.EGO_DARKENED * share, photograph.shape[1]))
+            image = torch.lerp(image, photograph, ego)
             number = number.masked_fill(ego > 0.5, 0)
         return Render(image, depth, number, opacity, drawn)
 

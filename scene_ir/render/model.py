@@ -325,6 +325,8 @@ CORNER = 0.45
 """Loss of light at the picture's corners, with the lens wide open."""
 NOISE, NOISE_LEVEL = 0.0006, 0.012
 """Standard deviation of the noise at black, and its growth with the display value."""
+EGO_DARKENED = 0.85
+"""Share of its display values that the ego vehicle, inside of which no lamp shines, loses by night."""
 NIGHT_BEND = 0.02
 """Display value about which the root that converts night's light to display values bends."""
 

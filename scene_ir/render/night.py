@@ -100,6 +100,11 @@ def measure_daylight(scene: SceneIR) -> float:
     return float(_ramp(np.array(float(scene.photograph.square().mean())), *model.BY_DAY))
 
 
+def night_share(code: Tensor, night: NightMaps) -> Tensor:
+    """How far () it is night, in [0, 1], under weather (6,); 0 at code 0."""
+    return torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) * (night.by_day / math.expm1(-model.NIGHTFALL))
+
+
 def apply_night(
     image: Tensor,
     inverse_depth: Tensor,
@@ -122,7 +127,7 @@ def apply_night(
         backend: Implementation.
     """
     code = environment.weather.to(image)
-    share = torch.expm1(-model.NIGHTFALL * code[Weather.NIGHT]) * (night.by_day / math.expm1(-model.NIGHTFALL))
+    share = night_share(code, night)
     growth = 1.0 + model.GLARE_FOG * code[Weather.FOG] + model.GLARE_RAIN * code[Weather.RAIN]
     sky, maps = environment.sky.to(image), night.maps.to(image)
     lamps = (

@@ -51,10 +51,22 @@ _WINDOW = 0.93
 """Display value from which a small area above the ground counts as a lamp or a lit window."""
 _GLARE = ((0.004, 0.5), (0.012, 0.25), (0.05, 0.12))
 """Blurs of the lens, in heights of the picture, and their shares."""
+_DARK_INSIDE = 0.985
+"""Loss of light inside of the ego vehicle."""
 _CORNER, _GRAIN = 0.8, 0.006
 """Loss of light towards the corners per square of the distance, in widths; deviation of the sensor's grain."""
 _WET_MIRROR = 0.25
 """Share of a lamp's light in its image on a wet road."""
+
+
+def _night_share(environment: Environment) -> float:
+    return 1 - (1 - float(environment.weather[Weather.NIGHT])) ** 4
+
+
+def darken_inside(image: Array, environment: Environment) -> Array:
+    """The picture (H, W, 3) as what is inside of the ego vehicle, where no lamp shines; unchanged by day."""
+    night = _night_share(environment)
+    return image * (1 - _DARK_INSIDE * night) ** (1 / GAMMA) if night else image
 
 
 def apply_night(
@@ -83,7 +95,7 @@ def apply_night(
     weather = to_numpy(environment.weather)
     if not (weather.any() or codes.any()):
         return image
-    night = 1 - (1 - float(weather[Weather.NIGHT])) ** 4
+    night = _night_share(environment)
     driven = 1 - float(np.exp(-(float(_LAMPS_LIT @ weather) ** 2)))
     light = np.clip(image, 0, None) ** GAMMA
     lamps = np.zeros_like(light)

@@ -22,7 +22,7 @@ from drivesem.failures.second_renderer import shading
 from drivesem.failures.second_renderer.baking import BakedAppearance, TextureAtlas, bake_atlas
 from drivesem.failures.second_renderer.base import SecondRender
 from drivesem.failures.second_renderer.geometry import BodyMesh, PictureCamera, VehiclePose, to_numpy
-from drivesem.failures.second_renderer.night import apply_night
+from drivesem.failures.second_renderer.night import apply_night, darken_inside
 from drivesem.failures.second_renderer.opengl import (
     SUPERSAMPLING,
     Array,
@@ -218,7 +218,8 @@ class PhotographRenderer:
         image = shading.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
         image = apply_night(image, depth_m, owner, environment, camera, poses, to_numpy(objects.lamps))
         if environment.ego is not None:
-            image = image + (self._photograph - image) * to_numpy(environment.ego)[..., None]
+            inside = darken_inside(self._photograph, environment)
+            image = image + (inside - image) * to_numpy(environment.ego)[..., None]
         image = np.rint(np.clip(image, 0, 1) * 255).astype(np.float32) / np.float32(255)
         shares = np.array([self._visible_share(p, owner == i + 1) for i, p in enumerate(placed)], np.float32)
         return _RenderedScene(placed, image, owner, shares)

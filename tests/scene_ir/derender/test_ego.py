@@ -14,6 +14,7 @@ from scene_ir.derender import ego
 from scene_ir.derender.derender import derender, place_vehicles
 from scene_ir.raster.verbs import Backend
 from scene_ir.render.compositor import Compositor, RenderSettings
+from scene_ir.render.model import EGO_DARKENED
 from scene_ir.types import Frame, SceneIR, Weather
 
 KITTI = Path(__file__).parents[4] / "shared" / "data" / "kitti" / "training" / "image_2"
@@ -62,8 +63,8 @@ def test_the_unperturbed_render_is_the_photograph(frame, scene):
 
 
 @pytest.mark.parametrize("backend", ["warp", "reference"])
-@pytest.mark.parametrize("code", [Weather.FOG, Weather.RAIN, Weather.TIME, Weather.NIGHT])
-def test_no_code_changes_it(scene, code, backend: Backend):
+@pytest.mark.parametrize("code", [Weather.FOG, Weather.RAIN, Weather.TIME])
+def test_no_code_but_night_changes_it(scene, code, backend: Backend):
     weather = torch.zeros(len(Weather))
     weather[code] = 1.0
     near = scene.objects.translation - torch.tensor([0.0, 0.0, 3.0])
@@ -77,13 +78,24 @@ def test_no_code_changes_it(scene, code, backend: Backend):
 
 
 @pytest.mark.parametrize("backend", ["warp", "reference"])
-def test_it_has_no_gradient(scene, backend: Backend):
+def test_it_is_dark_by_night(scene, backend: Backend):
+    weather = torch.eye(len(Weather))[Weather.NIGHT]
+    compositor = Compositor(scene, RenderSettings(backend))
+    image = compositor.render(scene.with_environment(weather=weather)).image
+    left = 1 - EGO_DARKENED * compositor.night_maps.by_day
+    assert left < 0.5
+    torch.testing.assert_close(image[:, solid(scene)], left * scene.photograph[:, solid(scene)])
+
+
+@pytest.mark.parametrize("backend", ["warp", "reference"])
+def test_it_has_no_gradient_but_to_night(scene, backend: Backend):
     weather = torch.full((len(Weather),), 0.3, requires_grad=True)
     translation = (scene.objects.translation - torch.tensor([0.0, 0.0, 2.0])).requires_grad_()
     changed = scene.with_objects(translation=translation).with_environment(weather=weather)
     image = Compositor(scene, RenderSettings(backend)).render(changed).image
     inside = torch.autograd.grad(image[:, solid(scene)].sum(), (weather, translation), retain_graph=True)
-    assert all(float(part.abs().max()) == 0 for part in inside)
+    assert [code for code in Weather if inside[0][code] != 0] == [Weather.NIGHT]
+    assert float(inside[1].abs().max()) == 0
     outside = torch.autograd.grad(image.sum(), (weather, translation))
     assert all(float(part.abs().max()) > 0 for part in outside)
 
