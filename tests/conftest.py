@@ -1,5 +1,6 @@
 """Shared by all tests: reproducible property tests, slow data made once, and the list of quick tests."""
 
+import functools
 import os
 import resource
 import shutil
@@ -14,6 +15,14 @@ from hypothesis import settings
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Processes that share the tests take a thread each: two threads in each of two are slower than one.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from drivesem.config import options
+from drivesem.synth import demo  # torch reads OMP_NUM_THREADS when it is imported
+
+# Most tests of commands begin with the same embedded street, which takes seconds to generate.
+demo.demo_scene = functools.lru_cache(maxsize=4)(demo.demo_scene)
+# A process takes seconds to start: commands start one only where a test has --workers.
+options._MAX_PROCESSES = 1
 
 QUICK = [
     "architecture",
@@ -114,6 +123,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     chosen = [Path(__file__).parent / name for name in QUICK]
     missing = [str(path) for path in chosen if not path.exists()]
     assert not (missing and config.option.markexpr == "quick"), f"no such tests: {', '.join(missing)}"
+    quick = {path for path in {item.path for item in items} if {path, *path.parents}.intersection(chosen)}
     for item in items:
-        if any(item.path == path or path in item.path.parents for path in chosen) and "slow" not in item.keywords:
+        if item.path in quick and "slow" not in item.keywords:
             item.add_marker(pytest.mark.quick)

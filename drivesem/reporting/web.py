@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 from importlib import resources
 from typing import Any
@@ -22,16 +23,21 @@ def render_page(template: str, script: str | None = None, **values: Any) -> str:
         script: `PACKAGE:FILE` of the only script that the content security policy allows, by its hash.
         values: Variables of the template; they are escaped.
     """
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, loader=jinja2.FunctionLoader(_read_resource)
-    )
     source = None if script is None else _read_resource(script)
-    return environment.get_template(template).render(
+    return _environment().get_template(template).render(
         format_count=format_count,
         style=Markup(_read_resource("drivesem.reporting:style.css")),
         script=None if source is None else Markup(source),
         script_hash=None if source is None else Markup(_hash_script(source)),
         **values,
+    )
+
+
+@functools.cache
+def _environment() -> jinja2.Environment:
+    """Return the environment of all pages; it keeps compiled templates."""
+    return jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, loader=jinja2.FunctionLoader(_read_resource)
     )
 
 

@@ -22,12 +22,13 @@ from scene_ir.raster.kernels import unpack_kernel
 from tests.pretended_gpu import CPU, GPU, place, pretended
 
 ALL = "color,weather,foliage,translate,rotate,mesh"
+ONE_STEP = ["--params", "color,translate", "--steps", "1", "--no-confirm", "--detector"]
 ATTACKS = {
     "si-fgsm": ["--params", ALL, "--steps", "2"],
     "climb": ["--combo", "2", "--method", "climb", "--passes", "60"],
-    "yolov3-slim": ["--combo", "2", "--steps", "1", "--detector", "yolov3-slim"],
-    "ensemble": ["--combo", "2", "--steps", "1", "--detector", "ensemble:squeezedet+yolov3-slim"],
-    "planted": ["--combo", "2", "--steps", "1", "--detector", "planted:height_px=20:60@squeezedet"],
+    "yolov3-slim": [*ONE_STEP, "yolov3-slim"],
+    "ensemble": [*ONE_STEP, "ensemble:squeezedet+yolov3-slim"],
+    "planted": [*ONE_STEP, "planted:height_px=20:60@squeezedet"],
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from scene_ir.io import load_scene
 from tests.drivesem.invoke import invoke, refusal, run_json
 from tests.drivesem.timid import CLASS, MISSED, PLACED, Timid
 
-WORDS = ["attack", "--combo", "2", "--steps", "2"]
+WORDS = ["attack", "--params", "color,translate", "--steps", "2"]
 PARTS = ("benign.png", "rerender.png", "counterexample.png", "overlay.png", "difference.png", "theta.json")
 
 
@@ -42,7 +43,8 @@ def contents(folder: Path) -> dict[str, Any]:
         if path.suffix == ".json":
             found[name] = without_times(json.loads(path.read_text()))
         elif path.suffix == ".yaml":
-            found[name] = [ln for ln in path.read_text().splitlines() if not ln.startswith(("out:", "limit:"))]
+            lines = path.read_text().splitlines()
+            found[name] = [line for line in lines if not line.startswith(("out:", "limit:", "workers:"))]
         else:
             found[name] = path.read_bytes()
     return found
@@ -51,7 +53,7 @@ def contents(folder: Path) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run") / "whole"
-    run_json(*WORDS, "--limit", "2", "--out", out)
+    run_json(*WORDS, "--limit", "2", "--workers", "2", "--out", out)
     return out
 
 
@@ -173,17 +175,22 @@ def test_a_frame_without_detections_before_is_not_attacked(tmp_path: Path) -> No
     assert last[1:] in page
 
 
+@functools.cache
+def first_car() -> torch.Tensor:
+    """Box (4,) px of the first car of the first embedded frame."""
+    return demo_scene(0, 0).objects.box2d[0]
+
+
 class Blinking:
     """A detector without gradient: the first car of the first embedded frame, surer the brighter the picture is."""
 
-    first = demo_scene(0, 0).objects.box2d[0]
     name, classes = "blinking", ("bus", "Car")
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         return images.mean(dim=(1, 2, 3))
 
     def decode(self, raw: torch.Tensor) -> list[Detections]:
-        box = self.first[None]
+        box = first_car()[None]
         return [Detections(box, torch.tensor([1]), mean[None].clamp(0, 1)) for mean in raw]
 
 
@@ -394,7 +401,7 @@ def test_incremental_passes_that_differ_are_reported_and_whole_ones_used(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """With a limit below 0, every detector's incremental passes differ."""
-    words = [*WORDS, "--limit", "2", "--workers", "1"]
+    words = ["attack", "--params", "rotate", "--steps", "1", "--limit", "2"]
     expected = run_json(*words, "--whole", "--out", tmp_path / "whole")
     monkeypatch.setattr(reference, "MAX_LOGIT_DIFFERENCE", -1.0)
     passes = []

@@ -44,7 +44,7 @@ class Blind:
 def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two embedded frames."""
     out = tmp_path_factory.mktemp("runs") / "source"
-    words = ["attack", "--combo", "2", "--limit", "2", "--workers", "1", "--json"]
+    words = ["attack", "--combo", "2", "--limit", "2", "--no-confirm", "--second-detector", "off", "--json"]
     assert main([*words, "--out", str(out)]) == 0
     return out
 
