@@ -59,7 +59,7 @@ QUICK = [
 ]
 """Tests of `pytest -m quick`: some of every package, in under a minute."""
 
-settings.register_profile("drivesem", deadline=None, derandomize=True, database=None)
+settings.register_profile("drivesem", max_examples=25, deadline=None, derandomize=True, database=None)
 settings.load_profile("drivesem")
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from averaged import AveragedRun
+from averaged import AveragedRun, autocast
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -549,7 +549,7 @@ class CutoutRun(AveragedRun[CutoutNet]):
             flip = torch.from_numpy(rng.random(len(samples)) < 0.5)
             weight = torch.from_numpy(np.stack([pixel_weights(s) for s in samples])[:, None])
             crops, first, truth, weight = mirror(crops, first, truth, weight, flip)
-            with torch.autocast("cpu", torch.bfloat16):
+            with autocast():
                 logits = self.network(crops, first)
             terms = {"first": initial_loss(logits, truth, weight)}
             seen = logits.detach().float().softmax(1)[:, :3]
@@ -561,7 +561,7 @@ class CutoutRun(AveragedRun[CutoutNet]):
             ]
             both, wanted = (torch.from_numpy(np.stack(part)) for part in zip(*tiles, strict=True))
             both = both.contiguous(memory_format=torch.channels_last)
-            with torch.autocast("cpu", torch.bfloat16):
+            with autocast():
                 change = self.network.refine(both[:, :3], both[:, 3:])
             terms["second"] = second_loss(change.float(), wanted)
             terms["total"] = terms["first"] + terms["second"]

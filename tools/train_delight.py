@@ -9,8 +9,6 @@ stopped, to the same bytes as one that was never stopped (one thread, one machin
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,17 +17,16 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from averaged import AveragedRun, multiscale_error
+from averaged import StreetRun, StreetSettings, load_frames, multiscale_error, parse_options
 from torch import Tensor
 from train_segmenter import (
     HORIZON_ERROR,
     STORE_HW,
     cast_shade,
-    options,
+    load_features,
     resample_crop,
     shrunk,
     surface_classes,
-    train,
     vary_camera,
     vary_colours,
     window,
@@ -38,7 +35,6 @@ from train_segmenter import (
 from drivesem.config.edits import FrameEdit
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import (
-    GENERATOR_VERSION,
     VARIANTS,
     SynthFrame,
     SynthSettings,
@@ -47,9 +43,7 @@ from drivesem.synth.frames import (
     render_frame,
 )
 from drivesem.synth.layout import LayoutSettings
-from scene_ir import files
 from scene_ir.derender import delight, unet
-from scene_ir.derender import segmentation as segment
 from scene_ir.derender.delight import DelightNet
 from scene_ir.derender.segmentation import StreetClass
 from scene_ir.render.environment import compute_closed_sky_gain
@@ -84,20 +78,14 @@ class PairStore:
     """
 
     def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        stamp = folder / "frames.json"
-        wanted = {"seed": seed, "split": split}
-        found = files.read_json(stamp) if stamp.is_file() else wanted | {"frames": 0}
-        if {k: found[k] for k in wanted} != wanted:
-            raise ValueError(f"{stamp}: expected frames of {wanted}, found {found}")
-        for index in range(found["frames"], frames):
+        def arrays(index: int) -> dict[str, np.ndarray]:
             pair = draw_pair(seed, index, split)
             images = [cv2.resize(p.image, STORE_HW[::-1], interpolation=cv2.INTER_AREA) for p in pair]
             elevation = unet.compute_elevation(pair[0].environment.ground, pair[0].camera, STORE_HW)
-            arrays = {"images": np.stack(images), "classes": shrunk(surface_classes(pair[0]))}
-            files.write_npz(folder / f"{index:05d}.npz", arrays | {"elevation": elevation.astype(np.float16)})
-            files.write_json(stamp, wanted | {"frames": index + 1})
-        parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
+            found = {"images": np.stack(images), "classes": shrunk(surface_classes(pair[0]))}
+            return found | {"elevation": elevation.astype(np.float16)}
+
+        parts = load_frames(folder, frames, seed, split, arrays)
         self.images, self.classes, self.elevation = (
             np.stack([p[name] for p in parts]) for name in ("images", "classes", "elevation")
         )
@@ -139,19 +127,11 @@ def example(store: PairStore, index: int, rng: np.random.Generator) -> DelightEx
 
 
 @dataclass(frozen=True)
-class DelightSettings:
-    """What decides on the result of a run."""
+class DelightSettings(StreetSettings):
+    """Settings of the network for the light of a closed sky."""
 
-    steps: int = 2000
-    batch: int = 8
-    frames: int = 360
-    """Pairs of the training set."""
-    rate: float = 2e-3
-    weight_decay: float = 0.02
-    average: float = 0.995
     gradient: float = 0.5
     """Weight of the slopes' term."""
-    seed: int = 0
 
 
 def build_batch(store: PairStore, step: int, settings: DelightSettings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -159,9 +139,8 @@ def build_batch(store: PairStore, step: int, settings: DelightSettings) -> tuple
     and the step alone."""
     examples = []
     for place in range(settings.batch):
-        epoch, inside = divmod(step * settings.batch + place, len(store))
-        order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
-        examples.append(example(store, int(order[inside]), np.random.default_rng([settings.seed, step, place])))
+        rng = np.random.default_rng([settings.seed, step, place])
+        examples.append(example(store, settings.frame_index(step, place, len(store)), rng))
     images, clouded = (
         torch.from_numpy(np.stack([getattr(e, name) for e in examples])).permute(0, 3, 1, 2)
         for name in ("image", "clouded")
@@ -187,7 +166,7 @@ def compute_loss(found: Tensor, true: Tensor, sky: Tensor, gradient: float) -> T
     return multiscale_error(apart, gradient)
 
 
-class DelightRun(AveragedRun[DelightNet]):
+class DelightRun(StreetRun[DelightNet]):
     """The network in training."""
 
     settings: DelightSettings
@@ -195,21 +174,13 @@ class DelightRun(AveragedRun[DelightNet]):
     def __init__(self, settings: DelightSettings) -> None:
         torch.manual_seed(settings.seed)
         network = DelightNet().train()
-        known = segment.load_network().state_dict()
-        network.load_state_dict({k: v for k, v in known.items() if not k.startswith("out.")}, strict=False)
+        load_features(network)
         super().__init__(network, settings)
-        self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def step(self, store: PairStore) -> float:
-        """One step of the optimiser; the loss."""
-        step, settings = self.step_number, self.settings
-        with self.timed():
-            images, clouded, elevation, sky = build_batch(store, step, settings)
-            warm = min(1.0, (step + 1) / 50)
-            found = CLOSED_SKY_LOG * torch.tanh(self.network(images, elevation) / 2)
-            loss = compute_loss(found, true_log_ratio(images, clouded), sky, settings.gradient)
-            self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
-        return float(loss.detach())
+    def compute_loss(self, store: PairStore) -> Tensor:
+        images, clouded, elevation, sky = build_batch(store, self.step_number, self.settings)
+        found = CLOSED_SKY_LOG * torch.tanh(self.network(images, elevation) / 2)
+        return compute_loss(found, true_log_ratio(images, clouded), sky, self.settings.gradient)
 
 
 def psnr_db(picture: np.ndarray, true: np.ndarray, region: np.ndarray) -> float:
@@ -243,7 +214,7 @@ CARD = """# The light of a closed sky, trained on generated streets
   under clouds to those in the photograph, within {bound} of 0. A guided filter moves their steps to the
   photograph's edges.
 - Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project.
-  SHA-256: `{digest}`
+  SHA-256: `{sha256}`
   Training starts from the
   segmenter's weights; nothing else is pretrained.
 - Data: {frames:,} streets of the project's own generator, version {version}, each under the sun and under a closed
@@ -286,40 +257,17 @@ TRAIN_SEED, HELD_SEED = 61, 62
 
 
 def main() -> None:
-    arguments = options(__doc__, Path("build/delight"), delight.WEIGHTS, 40, DelightSettings)
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    settings = DelightSettings(
-        arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed
-    )
+    arguments, settings = parse_options(__doc__, Path("build/delight"), delight.WEIGHTS, 40, DelightSettings)
     store = PairStore(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
-    print(f"{len(store)} pairs", flush=True)
     run = DelightRun(settings)
-    if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
+    if not run.train(store, arguments.run, arguments.pause_after):
         return
-    network = run.averaged()
-    metrics = judge(network, [draw_pair(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
-    print(format_table(metrics))
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
-    run.ship(arguments.out, facts)
-    card = CARD.format(
-        parameters=sum(p.numel() for p in network.parameters()),
-        focal=unet.INPUT_FOCAL_PX,
-        bound=CLOSED_SKY_LOG,
-        file=arguments.out.name,
-        digest=files.sha256_digest(arguments.out),
-        frames=settings.frames,
-        version=GENERATOR_VERSION,
-        clouded=CLOUDED_SHARE,
-        steps=settings.steps,
-        batch=settings.batch,
-        minutes=run.seconds / 60,
-        seed=settings.seed,
-        note=f"\n  {arguments.remark}" if arguments.remark else "",
-        held_out=arguments.held_out,
-        table=format_table(metrics),
-    )
-    files.write_text(arguments.out.with_suffix(".md"), card)
+    pairs = [draw_pair(HELD_SEED, index, "heldout") for index in range(arguments.held_out)]
+    metrics = judge(run.averaged(), pairs)
+    table = format_table(metrics)
+    print(table)
+    limits = {"bound": CLOSED_SKY_LOG, "clouded": CLOUDED_SHARE}
+    run.write_results(arguments, CARD, metrics, focal=unet.INPUT_FOCAL_PX, table=table, **limits)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ where it was stopped, to the same bytes as one that was never stopped (one threa
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,26 +17,24 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from averaged import AveragedRun, multiscale_error
+from averaged import StreetRun, StreetSettings, autocast, load_frames, multiscale_error, parse_options
 from torch import Tensor
 from train_segmenter import (
     CLASS_OF,
     HORIZON_ERROR,
     STORE_HW,
-    options,
+    load_features,
     plan_street,
     resample_crop,
     shrunk,
     surface_classes,
-    train,
     vary_camera,
     vary_colours,
     vary_light,
     window,
 )
 
-from drivesem.synth.frames import GENERATOR_VERSION, SynthFrame, render_frame
-from scene_ir import files
+from drivesem.synth.frames import SynthFrame, render_frame
 from scene_ir.derender import depth, unet
 from scene_ir.derender import depth as maps
 from scene_ir.derender import segmentation as segment
@@ -102,16 +98,9 @@ class DepthStore:
     the one with actors, 2i + 1 the one without."""
 
     def __init__(self, folder: Path, frames: int, seed: int, split: str) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        stamp = folder / "frames.json"
-        wanted = {"seed": seed, "split": split}
-        found = files.read_json(stamp) if stamp.is_file() else wanted | {"frames": 0}
-        if {k: found[k] for k in wanted} != wanted:
-            raise ValueError(f"{stamp}: expected frames of {wanted}, found {found}")
-        for index in range(found["frames"], frames):
-            files.write_npz(folder / f"{index:05d}.npz", training_pictures(street(seed, index, split)))
-            files.write_json(stamp, wanted | {"frames": index + 1})
-        parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
+        parts = load_frames(
+            folder, frames, seed, split, lambda index: training_pictures(street(seed, index, split))
+        )
         self.images, self.classes, self.nearness = (
             np.concatenate([p[name] for p in parts]) for name in ("images", "classes", "nearness")
         )
@@ -160,19 +149,13 @@ def example(store: DepthStore, index: int, rng: np.random.Generator) -> DepthExa
 
 
 @dataclass(frozen=True)
-class DepthSettings:
-    """What decides on the result of a run."""
+class DepthSettings(StreetSettings):
+    """Settings of the depth network."""
 
     steps: int = 2600
-    batch: int = 8
     frames: int = 500
-    """Of the training set."""
-    rate: float = 2e-3
-    weight_decay: float = 0.02
-    average: float = 0.995
     gradient: float = 0.5
     """Weight of the slopes' term."""
-    seed: int = 0
 
 
 Batch = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -183,9 +166,8 @@ def build_batch(store: DepthStore, step: int, settings: DepthSettings) -> Batch:
     the seed and the step alone."""
     examples = []
     for place in range(settings.batch):
-        epoch, inside = divmod(step * settings.batch + place, len(store))
-        order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
-        examples.append(example(store, int(order[inside]), np.random.default_rng([settings.seed, step, place])))
+        rng = np.random.default_rng([settings.seed, step, place])
+        examples.append(example(store, settings.frame_index(step, place, len(store)), rng))
     maps_of = (np.stack([getattr(e, name) for e in examples]) for name in ("elevation", "ground", "nearness"))
     elevation, ground, near = (torch.from_numpy(m.astype(np.float32))[:, None] for m in maps_of)
     images = torch.from_numpy(np.stack([e.image for e in examples])).permute(0, 3, 1, 2)
@@ -200,7 +182,7 @@ def compute_loss(numbers: Tensor, ground: Tensor, near: Tensor, gradient: float)
     return multiscale_error(apart, gradient)
 
 
-class DepthRun(AveragedRun[DepthNet]):
+class DepthRun(StreetRun[DepthNet]):
     """The network in training."""
 
     settings: DepthSettings
@@ -208,22 +190,14 @@ class DepthRun(AveragedRun[DepthNet]):
     def __init__(self, settings: DepthSettings) -> None:
         torch.manual_seed(settings.seed)
         network = DepthNet().train()
-        known = segment.load_network().state_dict()
-        network.load_state_dict({k: v for k, v in known.items() if not k.startswith("out.")}, strict=False)
+        load_features(network)
         super().__init__(network, settings)
-        self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def step(self, store: DepthStore) -> float:
-        """One step of the optimiser; the loss."""
-        step, settings = self.step_number, self.settings
-        with self.timed():
-            images, elevation, ground, near = build_batch(store, step, settings)
-            warm = min(1.0, (step + 1) / 50)
-            with torch.autocast("cpu", torch.bfloat16):
-                numbers = self.network(images, elevation)
-            loss = compute_loss(numbers.float(), ground, near, settings.gradient)
-            self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
-        return float(loss.detach())
+    def compute_loss(self, store: DepthStore) -> Tensor:
+        images, elevation, ground, near = build_batch(store, self.step_number, self.settings)
+        with autocast():
+            numbers = self.network(images, elevation)
+        return compute_loss(numbers.float(), ground, near, self.settings.gradient)
 
 
 FAR_M = 120.0
@@ -311,41 +285,17 @@ TRAIN_SEED, HELD_SEED = 51, 52
 
 
 def main() -> None:
-    arguments = options(__doc__, Path("build/depth"), depth.WEIGHTS, 40, DepthSettings)
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    settings = DepthSettings(
-        arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed
-    )
+    arguments, settings = parse_options(__doc__, Path("build/depth"), depth.WEIGHTS, 40, DepthSettings)
     store = DepthStore(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
-    print(f"{len(store)} pictures", flush=True)
     run = DepthRun(settings)
-    if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
+    if not run.train(store, arguments.run, arguments.pause_after):
         return
-    network = run.averaged()
-    metrics = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
-    print(format_table(metrics))
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
-    run.ship(arguments.out, facts)
-    card = CARD.format(
-        parameters=sum(p.numel() for p in network.parameters()),
-        focal=unet.INPUT_FOCAL_PX,
-        file=arguments.out.name,
-        frames=settings.frames,
-        version=GENERATOR_VERSION,
-        higher=HIGHER_FROM,
-        low=HIGHER[0],
-        high=HIGHER[1],
-        steps=settings.steps,
-        batch=settings.batch,
-        minutes=run.seconds / 60,
-        seed=settings.seed,
-        note=f"\n  {arguments.remark}" if arguments.remark else "",
-        held_out=arguments.held_out,
-        far=FAR_M,
-        table=format_table(metrics),
-    )
-    files.write_text(arguments.out.with_suffix(".md"), card)
+    frames = [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)]
+    metrics = judge(run.averaged(), frames)
+    table = format_table(metrics)
+    print(table)
+    reach = {"higher": HIGHER_FROM, "low": HIGHER[0], "high": HIGHER[1], "far": FAR_M}
+    run.write_results(arguments, CARD, metrics, focal=unet.INPUT_FOCAL_PX, table=table, **reach)
 
 
 if __name__ == "__main__":

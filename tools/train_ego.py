@@ -9,7 +9,6 @@ stopped, to the same bytes as one that was never stopped (one thread, one machin
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,24 +18,21 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from averaged import AveragedRun
+from averaged import StreetRun, StreetSettings, parse_options
 from torch import Tensor
 from train_segmenter import (
     STORE_HW,
     SegmentStore,
-    options,
+    load_features,
     paste_unknown_objects,
     plan_street,
-    train,
     vary_camera,
     vary_colours,
     vary_light,
 )
 
-from drivesem.synth.frames import GENERATOR_VERSION, SynthFrame, render_frame
-from scene_ir import files
+from drivesem.synth.frames import SynthFrame, render_frame
 from scene_ir.derender import ego
-from scene_ir.derender import segmentation as segment
 from scene_ir.derender.ego import INPUT_HW, EgoNet
 from scene_ir.types import Camera
 
@@ -271,17 +267,13 @@ def make_picture(
 
 
 @dataclass(frozen=True)
-class EgoSettings:
-    """What decides on the result of a run."""
+class EgoSettings(StreetSettings):
+    """Settings of the network for the ego vehicle."""
 
     steps: int = 1100
-    batch: int = 8
     frames: int = 300
-    """Of the training set."""
     rate: float = 3e-3
-    weight_decay: float = 0.02
     average: float = 0.99
-    seed: int = 0
 
 
 def build_batch(store: SegmentStore, step: int, settings: EgoSettings) -> tuple[Tensor, Tensor]:
@@ -301,30 +293,20 @@ def compute_loss(logits: Tensor, shares: Tensor) -> Tensor:
     return F.binary_cross_entropy_with_logits(logits, F.avg_pool2d(shares[:, None], 2))
 
 
-class EgoRun(AveragedRun[EgoNet]):
+class EgoRun(StreetRun[EgoNet]):
     """The network in training."""
-
-    settings: EgoSettings
 
     def __init__(self, settings: EgoSettings) -> None:
         torch.manual_seed(settings.seed)
         network = EgoNet().train()
-        known = segment.load_network().state_dict()
-        network.load_state_dict({k: v for k, v in known.items() if not k.startswith("out.")}, strict=False)
+        load_features(network)
         super().__init__(network, settings)
         # Without a bias for the class's rareness all features learn to lower it, and none to raise it.
         torch.nn.init.constant_(self.network.out.bias, RARENESS)  # pyright: ignore[reportArgumentType]
-        self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def step(self, store: SegmentStore) -> float:
-        """One step of the optimiser; the loss."""
-        step, settings = self.step_number, self.settings
-        with self.timed():
-            images, shares = build_batch(store, step, settings)
-            warm = min(1.0, (step + 1) / 50)
-            loss = compute_loss(self.network(images, ego.row_map(len(images))), shares)
-            self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
-        return float(loss.detach())
+    def compute_loss(self, store: SegmentStore) -> Tensor:
+        images, shares = build_batch(store, self.step_number, self.settings)
+        return compute_loss(self.network(images, ego.row_map(len(images))), shares)
 
 
 def judge(network: EgoNet, store: SegmentStore, pictures: int) -> dict[str, float]:
@@ -369,7 +351,7 @@ CARD = """# The ego vehicle in photographs, trained on generated streets
 
 ## Figures
 
-{pictures:,} held-out pictures (streets that no training frame has), as the masks are used; the darkest, which count as
+{held_out:,} held-out pictures (streets that no training frame has), as the masks are used; the darkest, which count as
 taken by night, have none:
 
 | quantity | value |
@@ -396,39 +378,16 @@ With the same generator, on the same machine, another run gives the same bytes.
 
 
 def main() -> None:
-    arguments = options(__doc__, Path("build/ego"), ego.WEIGHTS, 400, EgoSettings)
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    settings = EgoSettings(arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed)
+    arguments, settings = parse_options(__doc__, Path("build/ego"), ego.WEIGHTS, 400, EgoSettings)
     store = SegmentStore(arguments.run / "train", settings.frames, TRAIN_SEED, "train", street)
-    print(f"{len(store)} frames", flush=True)
     run = EgoRun(settings)
-    if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
+    if not run.train(store, arguments.run, arguments.pause_after):
         return
-    network = run.averaged()
     held_out = SegmentStore(arguments.run / "heldout", 40, HELD_SEED, "heldout", street)
-    metrics = judge(network, held_out, arguments.held_out)
+    metrics = judge(run.averaged(), held_out, arguments.held_out)
     print(metrics)
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
-    run.ship(arguments.out, facts)
     height, width = INPUT_HW
-    card = CARD.format(
-        parameters=sum(p.numel() for p in network.parameters()),
-        height=height,
-        width=width,
-        file=arguments.out.name,
-        sha256=files.sha256_digest(arguments.out),
-        frames=len(store),
-        version=GENERATOR_VERSION,
-        steps=settings.steps,
-        batch=settings.batch,
-        minutes=run.seconds / 60,
-        seed=settings.seed,
-        pictures=arguments.held_out,
-        note=f"\n  {arguments.remark}" if arguments.remark else "",
-        **metrics,
-    )
-    files.write_text(arguments.out.with_suffix(".md"), card)
+    run.write_results(arguments, CARD, metrics, height=height, width=width, **metrics)
 
 
 if __name__ == "__main__":

@@ -8,24 +8,18 @@ same bytes as one that was never stopped (one thread, one machine).
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from averaged import AveragedRun
-from torch import Tensor
+from averaged import StreetRun, StreetSettings, autocast, load_frames, parse_options
+from torch import Tensor, nn
 
 from drivesem.synth.frames import (
-    GENERATOR_VERSION,
     VARIANTS,
     Plan,
     SynthFrame,
@@ -37,7 +31,6 @@ from drivesem.synth.frames import (
 from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.soup import Material, Semantic
 from drivesem.synth.variations import MIXED, VARIATIONS
-from scene_ir import files
 from scene_ir.derender import segmentation as segment
 from scene_ir.derender import unet
 from scene_ir.derender.segmentation import SegmentNet, StreetClass
@@ -125,23 +118,14 @@ class SegmentStore:
         make: Callable[[int, int, str], SynthFrame] | None = None,
     ) -> None:
         """make: the frame of a seed, an index and a split; by default `street`."""
-        folder.mkdir(parents=True, exist_ok=True)
-        stamp = folder / "frames.json"
-        wanted = {"seed": seed, "split": split}
-        found = files.read_json(stamp) if stamp.is_file() else wanted | {"frames": 0}
-        if {k: found[k] for k in wanted} != wanted:
-            raise ValueError(f"{stamp}: expected frames of {wanted}, found {found}")
-        height, width = STORE_HW
-        for index in range(found["frames"], frames):
+
+        def arrays(index: int) -> dict[str, np.ndarray]:
             frame = (make or street)(seed, index, split)
-            image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
-            height_of = unet.compute_elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
-            files.write_npz(
-                folder / f"{index:05d}.npz",
-                {"image": image, "classes": shrunk(surface_classes(frame)), "elevation": height_of},
-            )
-            files.write_json(stamp, wanted | {"frames": index + 1})
-        parts = [files.read_npz(folder / f"{index:05d}.npz") for index in range(frames)]
+            image = cv2.resize(frame.image, STORE_HW[::-1], interpolation=cv2.INTER_AREA)
+            elevation = unet.compute_elevation(frame.environment.ground, frame.camera, STORE_HW).astype(np.float16)
+            return {"image": image, "classes": shrunk(surface_classes(frame)), "elevation": elevation}
+
+        parts = load_frames(folder, frames, seed, split, arrays)
         self.images = np.stack([p["image"] for p in parts])
         self.classes = np.stack([p["classes"] for p in parts])
         self.elevation = np.stack([p["elevation"] for p in parts])
@@ -292,17 +276,13 @@ def vary_camera(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class SegmentSettings:
-    """What decides on the result of a run."""
+class SegmentSettings(StreetSettings):
+    """Settings of the segmenter."""
 
     steps: int = 1800
-    batch: int = 8
     frames: int = 340
-    """Of the training set."""
     rate: float = 3e-3
-    weight_decay: float = 0.02
     average: float = 0.99
-    seed: int = 0
 
 
 HORIZON_ERROR = 0.012
@@ -314,11 +294,8 @@ def build_batch(store: SegmentStore, step: int, settings: SegmentSettings) -> tu
     step alone."""
     images, heights, classes = [], [], []
     for place in range(settings.batch):
-        number = step * settings.batch + place
-        epoch, inside = divmod(number, len(store))
-        order = np.random.default_rng([settings.seed, 1_000_000 + epoch]).permutation(len(store))
         rng = np.random.default_rng([settings.seed, step, place])
-        image, found, height = random_crop(store, int(order[inside]), rng)
+        image, found, height = random_crop(store, settings.frame_index(step, place, len(store)), rng)
         vary_surfaces(image, found, height, rng)
         images.append(vary_camera(image, rng))
         classes.append(found)
@@ -341,27 +318,24 @@ def compute_loss(logits: Tensor, classes: Tensor) -> Tensor:
     return -(shares * logits.log_softmax(1) * weights).sum(1).mean()
 
 
-class SegmentRun(AveragedRun[SegmentNet]):
+class SegmentRun(StreetRun[SegmentNet]):
     """The network in training."""
-
-    settings: SegmentSettings
 
     def __init__(self, settings: SegmentSettings) -> None:
         torch.manual_seed(settings.seed)
         super().__init__(SegmentNet().train(), settings)
-        self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    def step(self, store: SegmentStore) -> float:
-        """One step of the optimiser; the loss."""
-        step, settings = self.step_number, self.settings
-        with self.timed():
-            images, heights, classes = build_batch(store, step, settings)
-            warm = min(1.0, (step + 1) / 50)
-            with torch.autocast("cpu", torch.bfloat16):
-                logits = self.network(images, heights)
-            loss = compute_loss(logits.float(), classes)
-            self.descend(loss, settings.rate * warm * 0.5 * (1 + math.cos(math.pi * step / settings.steps)))
-        return float(loss.detach())
+    def compute_loss(self, store: SegmentStore) -> Tensor:
+        images, heights, classes = build_batch(store, self.step_number, self.settings)
+        with autocast():
+            logits = self.network(images, heights)
+        return compute_loss(logits.float(), classes)
+
+
+def load_features(network: nn.Module) -> None:
+    """Take all weights but the last layer's from the shipped segmenter."""
+    known = segment.load_network().state_dict()
+    network.load_state_dict({k: v for k, v in known.items() if not k.startswith("out.")}, strict=False)
 
 
 JUDGED = ("sky", "foliage", "road", "vehicle")
@@ -439,79 +413,18 @@ TRAIN_SEED, HELD_SEED = 41, 42
 """Of the generator's streams."""
 
 
-def options(about: str | None, run: Path, weights: Path, held_out: int, usual: Any) -> argparse.Namespace:
-    """The command line. about: what the tool does; run, weights, held_out, usual: its defaults."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, default=run, help="frames, checkpoint, log")
-    parser.add_argument("--out", type=Path, default=weights)
-    parser.add_argument("--frames", type=int, default=usual.frames)
-    parser.add_argument("--held-out", type=int, default=held_out, help="generated frames to judge by")
-    parser.add_argument("--steps", type=int, default=usual.steps)
-    parser.add_argument("--batch", type=int, default=usual.batch)
-    parser.add_argument("--rate", type=float, default=usual.rate)
-    parser.add_argument("--seed", type=int, default=usual.seed)
-    parser.add_argument(
-        "--pause-after", type=int, help="stop after so many steps of this call; call again to go on"
-    )
-    parser.add_argument("--remark", default="", help="a remark on this run for the model card")
-    return parser.parse_args()
-
-
-def train(run: Any, store: Any, steps: int, folder: Path, pause_after: int | None) -> bool:
-    """Train from the checkpoint in `folder` on; return whether all steps are done. pause_after: steps of
-    this call, None for all.
-    """
-    checkpoint = folder / "checkpoint.safetensors"
-    if checkpoint.is_file():
-        run.load(checkpoint)
-        print(f"going on from step {run.step_number}", flush=True)
-    end = min(steps, run.step_number + (pause_after or steps))
-    with (folder / "log.csv").open("a", newline="") as file:
-        log = csv.writer(file)
-        while run.step_number < end:
-            loss = run.step(store)
-            if run.step_number % 25 == 0:
-                log.writerow([run.step_number, f"{run.seconds:.1f}", f"{loss:.4f}"])
-                file.flush()
-            if run.step_number % 100 == 0 or run.step_number == end:
-                run.save(checkpoint)
-                print(f"step {run.step_number}, {run.seconds:.0f} s: {loss:.3f}", flush=True)
-    return run.step_number >= steps
-
-
 def main() -> None:
-    arguments = options(__doc__, Path("build/segment"), segment.WEIGHTS, 60, SegmentSettings)
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    settings = SegmentSettings(
-        arguments.steps, arguments.batch, arguments.frames, arguments.rate, seed=arguments.seed
-    )
+    arguments, settings = parse_options(__doc__, Path("build/segment"), segment.WEIGHTS, 60, SegmentSettings)
     store = SegmentStore(arguments.run / "train", settings.frames, TRAIN_SEED, "train")
-    print(f"{len(store)} frames", flush=True)
     run = SegmentRun(settings)
-    if not train(run, store, settings.steps, arguments.run, arguments.pause_after):
+    if not run.train(store, arguments.run, arguments.pause_after):
         return
-    network = run.averaged()
-    metrics = judge(network, [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)])
-    print(format_table(metrics))
-    facts = {"steps": str(settings.steps), "seed": str(settings.seed), "metrics": json.dumps(metrics)}
-    run.ship(arguments.out, facts)
-    card = CARD.format(
-        parameters=sum(p.numel() for p in network.parameters()),
-        focal=unet.INPUT_FOCAL_PX,
-        classes=", ".join(kind.name.lower() for kind in StreetClass),
-        file=arguments.out.name,
-        frames=len(store),
-        version=GENERATOR_VERSION,
-        steps=settings.steps,
-        batch=settings.batch,
-        minutes=run.seconds / 60,
-        seed=settings.seed,
-        held_out=arguments.held_out,
-        table=format_table(metrics),
-        note=f"\n  {arguments.remark}" if arguments.remark else "",
-    )
-    files.write_text(arguments.out.with_suffix(".md"), card)
+    frames = [street(HELD_SEED, index, "heldout") for index in range(arguments.held_out)]
+    metrics = judge(run.averaged(), frames)
+    table = format_table(metrics)
+    print(table)
+    classes = ", ".join(kind.name.lower() for kind in StreetClass)
+    run.write_results(arguments, CARD, metrics, focal=unet.INPUT_FOCAL_PX, classes=classes, table=table)
 
 
 if __name__ == "__main__":
