@@ -24,12 +24,16 @@ def render_page(template: str, script: str | None = None, **values: Any) -> str:
         values: Variables of the template; they are escaped.
     """
     source = None if script is None else _read_resource(script)
-    return _environment().get_template(template).render(
-        format_count=format_count,
-        style=Markup(_read_resource("drivesem.reporting:style.css")),
-        script=None if source is None else Markup(source),
-        script_hash=None if source is None else Markup(_hash_script(source)),
-        **values,
+    return (
+        _environment()
+        .get_template(template)
+        .render(
+            format_count=format_count,
+            style=Markup(_read_resource("drivesem.reporting:style.css")),
+            script=None if source is None else Markup(source),
+            script_hash=None if source is None else Markup(_hash_script(source)),
+            **values,
+        )
     )
 
 
