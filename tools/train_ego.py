@@ -276,7 +276,7 @@ class EgoSettings(StreetSettings):
     average: float = 0.99
 
 
-def build_batch(store: SegmentStore, step: int, settings: EgoSettings) -> tuple[Tensor, Tensor]:
+def build_batch(store: SegmentStore, step: int, settings: StreetSettings) -> tuple[Tensor, Tensor]:
     """Images (N, 3, h, w) and shares (N, h, w) of a step: a function of the seed and the step alone."""
     images, shares = [], []
     for place in range(settings.batch):

@@ -289,7 +289,7 @@ HORIZON_ERROR = 0.012
 """Standard deviation of the elevation given to the network: a plane estimated from a photograph is off."""
 
 
-def build_batch(store: SegmentStore, step: int, settings: SegmentSettings) -> tuple[Tensor, Tensor, Tensor]:
+def build_batch(store: SegmentStore, step: int, settings: StreetSettings) -> tuple[Tensor, Tensor, Tensor]:
     """Images (N, 3, h, w), elevations (N, 1, h, w) and classes (N, h, w) of a step: a function of the seed and the
     step alone."""
     images, heights, classes = [], [], []

@@ -24,25 +24,22 @@ def render_page(template: str, script: str | None = None, **values: Any) -> str:
         values: Variables of the template; they are escaped.
     """
     source = None if script is None else _read_resource(script)
-    return (
-        _environment()
-        .get_template(template)
-        .render(
-            format_count=format_count,
-            style=Markup(_read_resource("drivesem.reporting:style.css")),
-            script=None if source is None else Markup(source),
-            script_hash=None if source is None else Markup(_hash_script(source)),
-            **values,
-        )
+    return _load_template(template).render(
+        format_count=format_count,
+        style=Markup(_read_resource("drivesem.reporting:style.css")),
+        script=None if source is None else Markup(source),
+        script_hash=None if source is None else Markup(_hash_script(source)),
+        **values,
     )
 
 
 @functools.cache
-def _environment() -> jinja2.Environment:
-    """Return the environment of all pages; it keeps compiled templates."""
-    return jinja2.Environment(
+def _load_template(name: str) -> jinja2.Template:
+    """Return a compiled template."""
+    environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, loader=jinja2.FunctionLoader(_read_resource)
     )
+    return environment.get_template(name)
 
 
 def _read_resource(name: str) -> str:
