@@ -20,7 +20,7 @@ WORDS = ("--method", "climb", "--budget", "street", "--params", "translate", "--
 
 
 def attacked(out: Path, kind: str) -> FrameResult:
-    words = ("attack", *WORDS, "--changes", kind, "--limit", "1", "--no-grade")
+    words = ("attack", *WORDS, "--changes", kind, "--limit", "1", "--no-confirm")
     assert main([*words, "--out", str(out), "--json"]) == 0
     return load_frame(out / "frames" / "demo-000" / "result.json")
 
