@@ -128,8 +128,8 @@ def recall_by_condition(
         size = draws if len(chosen) > 1 else 0
         drawn = generator.multinomial(len(chosen), np.full(len(chosen), 1 / len(chosen)), size=size)
         total = own_counts.sum(axis=0)
-        plain, equal = _recalls(own_hits.sum(axis=0)[None], total[None], shares)
-        plain_draws, equal_draws = _recalls(drawn @ own_hits, drawn @ own_counts, shares)
+        plain, equal = average_recalls(own_hits.sum(axis=0)[None], total[None], shares)
+        plain_draws, equal_draws = average_recalls(drawn @ own_hits, drawn @ own_counts, shares)
         heights = objects.height[np.isin(objects.frame, chosen)]
         rows.append(
             ConditionRow(
@@ -147,10 +147,17 @@ def recall_by_condition(
     return rows
 
 
-def _recalls(hits: Floats, counts: Floats, shares: Floats) -> tuple[Floats, Floats]:
-    """Return the recall (D,), and the recall (D,) averaged over bins by `shares` (B,) of those that have objects.
+def average_recalls(hits: Floats, counts: Floats, shares: Floats) -> tuple[Floats, Floats]:
+    """Average recalls over bins of box height.
 
-    `hits` and `counts` are (D, B); NaN where there is no object.
+    Args:
+        hits: (D, B) detected objects.
+        counts: (D, B) objects.
+        shares: (B,) weight of each bin.
+
+    Returns:
+        The recall (D,) of all objects, and the recall (D,) averaged by `shares` over the bins that have objects; NaN
+        where there is no object.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         plain = hits.sum(axis=1) / counts.sum(axis=1)

@@ -239,7 +239,7 @@ class ConditionSets:
                 yield ConditionFrame(JOINT, True, f"{name}-{k}", boxes, read)
 
     def _draw_state(self, name: str, k: int, path: Path) -> Picture:
-        scene = self._scene(name)
+        scene = self.scene(name)
         space = ParameterSpace(scene.ir, [Parameter.WEATHER], PRESETS[STREET])
         generator = np.random.default_rng([self._config.seed, k, *_digest(name)])
         # Ends of the codes' ranges are where attacks drive them.
@@ -265,13 +265,11 @@ class ConditionSets:
 
     def _draw(self, name: str, settings: dict[str, float], path: Path) -> Picture:
         if not path.is_file():
-            picture = self._scene(name).edit(weather=settings).render()
-            parameters = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-            _, encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), parameters)
-            files.write_bytes(path, encoded.tobytes())
+            files.write_bytes(path, encode_jpeg(self.scene(name).edit(weather=settings).render()))
         return files.read_image(path)
 
-    def _scene(self, name: str) -> ds.Scene:
+    def scene(self, name: str) -> ds.Scene:
+        """The scene of a frame, de-rendered once into the folder `scenes` of --out."""
         folder = self._out / "scenes" / name
         with suppress(SceneError):
             return ds.load_scene(folder)
@@ -279,6 +277,12 @@ class ConditionSets:
         with files.atomic_folder(folder) as part:
             save_scene(scene.ir, part)
         return scene
+
+
+def encode_jpeg(picture: Picture) -> bytes:
+    """A picture (H, W, 3) as the JPEG file in which drawn pictures are stored."""
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    return cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), parameters)[1].tobytes()
 
 
 def _frame(condition: str, drawn: bool, dataset: Dataset, name: str) -> ConditionFrame:
@@ -537,13 +541,15 @@ def detect_frames(
     for frame in frames:
         picture = frame.read()
         for detector in detectors:
-            hits = _hits(cache, detector, picture, frame.boxes_xyxy)
+            hits = detect_hits(cache, detector, picture, frame.boxes_xyxy)
             height = (frame.boxes_xyxy[:, 3] - frame.boxes_xyxy[:, 1]) * LINES / picture.shape[0]
             judged = height >= LEAST_HEIGHT_PX
             yield DetectedFrame(detector.name, frame.condition, frame.drawn, height[judged], hits[judged])
 
 
-def _hits(cache: ResultCache, detector: RecallDetector, picture: Picture, boxes_xyxy: Floats) -> NDArray[np.bool_]:
+def detect_hits(
+    cache: ResultCache, detector: RecallDetector, picture: Picture, boxes_xyxy: Floats
+) -> NDArray[np.bool_]:
     """Whether each box (N, 4) of a vehicle is detected; a detection counts for one box."""
 
     @torch.no_grad()

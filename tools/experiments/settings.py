@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from drivesem.config.commands import MIN_PASSES, Fraction, RunArguments, RunFolders
-from drivesem.config.constraints import POSITIVE, ExistingFolder, NumberRange, Required, at_least
+from drivesem.config.constraints import POSITIVE, ExistingFolder, NumberRange, OneOf, Required, at_least
 from drivesem.config.errors import refuse
 from drivesem.config.options import (
     DEMO,
@@ -185,6 +185,79 @@ class FidelityConfig(SeededBootstrapOptions, CommandConfig):
     """Folder of the results; the same command resumes what it finds there."""
     streets: Annotated[int, at_least(2, "one to fit, one to test")] = 60
     """Number of generated streets; every other one is held out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealityConfig(SeededBootstrapOptions, CommandConfig):
+    """Compare failures on dry-day photographs with failures in real fog, rain, snow, dusk and night."""
+
+    part: tyro.conf.Positional[Literal["attack", "rules", "observe", "retrain", "report"]] = "report"
+    """attack: attack days of half A and sample objects; rules: fix the rules; observe: run detectors on the frames of
+    --half; retrain: train the arms and test them; report: compute the tables."""
+    out: str | None = None
+    """Folder of the results; the same command resumes what it finds there."""
+    results: Annotated[str | None, ExistingFolder(), tyro.conf.arg(aliases=["--from"])] = None
+    """report: folder of stored tables, such as docs/data/reality (default: those of --out)."""
+    root: str | None = None
+    """Folder of BDD100K's frames in COCO's layout, with weather and timeofday."""
+    fog_root: str | None = None
+    """Folder of real frames in fog (DAWN) in COCO's layout."""
+    kitti_root: str | None = None
+    """attack: folder of KITTI frames to attack as well."""
+    train_root: str | None = None
+    """retrain: folder of real dry days in COCO's layout."""
+    half: Annotated[str, OneOf(("A", "B"))] = "B"
+    """observe: half of the real frames."""
+    half_a: str | None = None
+    """Folder of tools.bench conditions with scenes and pictures of half A (default: half-A in --out)."""
+    half_b: str | None = None
+    """The same of half B."""
+    detectors: str = "squeezedet,yolov3-slim"
+    """Detectors to observe, with commas; NAME@SCORE sets a threshold other than t*."""
+    attacked: str = "squeezedet"
+    """Detectors to attack, with commas."""
+    drawn: Count = 24
+    """Sunny days on which weather is drawn, or that are attacked, at most."""
+    real: Count = 1000
+    """Most real frames of each condition of half B."""
+    real_a: Count = 24
+    """The same of half A."""
+    attack_frames: Count = 12
+    """Sunny days of half A to attack."""
+    kitti_frames: Count = 6
+    """Frames of --kitti-root to attack."""
+    passes: Count = 45
+    """Detector passes of each attack."""
+    samples: Count = 24
+    """Samples around each certain failure."""
+    contrast: Count = 16
+    """Samples of each frame in which all objects change."""
+    rules: Count = 5
+    """Rules of each attacked detector."""
+    detector: str = "squeezedet"
+    """retrain: detector to fine-tune."""
+    arms: str = "days,usual,random,worst"
+    """retrain: arms, with commas."""
+    days: Count = 300
+    """retrain: dry days to train on."""
+    edited: Count = 60
+    """retrain: how many of them are de-rendered and edited."""
+    states: Count = 4
+    """retrain: random states of each; the arm worst takes the one with the largest loss."""
+    train_steps: Count = 200
+    """retrain: training steps of each arm."""
+    batch: Count = 4
+    """retrain: pictures per step."""
+    seeds: Count = 1
+    """retrain: seeds of each arm."""
+
+    def check(self) -> None:
+        super().check()
+        refuse(self.part != "report" and self.results is not None, "--from", "none but with report", self.part)
+        refuse(self.part != "report" and self.out is None, "--out", "a folder", "none")
+        refuse(self.part == "report" and self.out is self.results is None, "--from", "a folder, or --out", "none")
+        refuse(self.part in ("attack", "observe", "retrain") and self.root is None, "--root", "a folder", "none")
+        refuse(self.part == "retrain" and self.train_root is None, "--train-root", "a folder", "none")
 
 
 @dataclass(frozen=True, kw_only=True)
