@@ -460,6 +460,7 @@ def fine_tune(
     out: Path,
     console: Console,
     auxiliary_loss: AuxiliaryLoss | None = None,
+    augment: AugmentSettings | None = None,
 ) -> None:
     """Fine-tune a detector in place, or resume, and freeze it again.
 
@@ -470,6 +471,7 @@ def fine_tune(
         out: Folder of the checkpoints.
         console: Where progress appears.
         auxiliary_loss: Further term of the loss.
+        augment: Augmentation, of which window and scale are those of the settings (default: the usual one).
 
     Raises:
         UsageError: The loss becomes infinite.
@@ -484,8 +486,10 @@ def fine_tune(
         precision=config.precision,
         seed=config.seed,
         checkpoint_every=config.checkpoint_every,
-        augment=AugmentSettings(
-            window_hw=parse_size_hw("--window", config.window), scale=parse_interval("--scale", config.scale)
+        augment=replace(
+            augment or AugmentSettings(),
+            window_hw=parse_size_hw("--window", config.window),
+            scale=parse_interval("--scale", config.scale),
         ),
     )
     if isinstance(detector, SqueezeDet):

@@ -214,11 +214,15 @@ class ConditionSets:
 
     def real(self, condition: Condition) -> Iterator[ConditionFrame]:
         """Real frames of a condition in the chosen half, in the order of the hash."""
+        for dataset, name in self.names(condition):
+            yield _frame(condition.name, False, dataset, name)
+
+    def names(self, condition: Condition) -> list[tuple[Dataset, str]]:
+        """Data sets and names of these frames."""
         names = [(self._bdd, name) for name in self._of(condition.times, condition.weathers)]
         if condition.of_fog_frames and self._fog is not None:
             names += [(self._fog, name) for name in self._fog.identifiers if self._in_half(name)]
-        for dataset, name in sorted(names, key=lambda pair: _digest(pair[1]))[: self._config.real]:
-            yield _frame(condition.name, False, dataset, name)
+        return sorted(names, key=lambda pair: _digest(pair[1]))[: self._config.real]
 
     def drawn(self, condition: str, settings: Mapping[str, float]) -> Iterator[ConditionFrame]:
         """Sunny days with vehicles under codes of weather; without codes, as photographed."""

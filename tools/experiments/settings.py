@@ -222,11 +222,11 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     """Most real frames of each condition of half B."""
     real_a: Count = 24
     """The same of half A."""
-    attack_frames: Count = 12
+    attack_frames: Count = 8
     """Sunny days of half A to attack."""
-    kitti_frames: Count = 6
+    kitti_frames: Count = 2
     """Frames of --kitti-root to attack."""
-    passes: Count = 45
+    passes: Count = 30
     """Detector passes of each attack."""
     samples: Count = 24
     """Samples around each certain failure."""
@@ -250,6 +250,8 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     """retrain: pictures per step."""
     seeds: Count = 1
     """retrain: seeds of each arm."""
+    test: Count = 40
+    """retrain: most real frames of each condition of half B to test on."""
 
     def check(self) -> None:
         super().check()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from drivesem.failures.neighbourhood import NEAR_REACH, ObjectSample, SceneSampl
 from drivesem.run.attack import attack_dataset
 from drivesem.run.finished import RebuiltFrame, load_run
 from drivesem.run.folder import load_attack_config, load_run_detector
-from scene_ir.io import to_uint8
+from scene_ir import files
+from scene_ir.io import save_scene, to_uint8
 from tools.bench.conditions import ConditionSets
 from tools.experiments.reality.features import ObjectFeatures, measure_objects
 from tools.experiments.reality.observations import conditions_config
@@ -25,6 +27,8 @@ from tools.experiments.tables import read_table, write_table
 
 PARAMS = "weather,color,translate,rotate"
 """What attacks may change."""
+_MOST_FAILURES = 3
+"""Failures of a frame that are sampled."""
 ATTACKS = "attacks"
 """Folder of the attacks' runs."""
 TABLE = "samples.csv.gz"
@@ -68,11 +72,12 @@ def split_threshold(detector: str) -> tuple[str, float | None]:
 
 def attack_days(config: RealityConfig, out: Path) -> None:
     """Attack sunny days of half A and KITTI with each of --attacked, sample them, and write the table."""
-    settings = conditions_config(config, "A")
-    sets = ConditionSets(settings)
-    for name in sets.base():
-        sets.scene(name)
-    sources = {"bdd": (SCENES, str(Path(settings.out or "") / "scenes"), config.attack_frames)}
+    sets = ConditionSets(conditions_config(config, "A"))
+    for name in sets.base()[: config.attack_frames]:
+        if not (out / "scenes" / name).is_dir():
+            with files.atomic_folder(out / "scenes" / name) as part:
+                save_scene(sets.scene(name).ir, part)
+    sources = {"bdd": (SCENES, str(out / "scenes"), config.attack_frames)}
     if config.kitti_root is not None:
         sources["kitti"] = ("kitti", config.kitti_root, config.kitti_frames)
     rows: list[RuleSample] = []
@@ -115,9 +120,9 @@ def _sample_run(config: RealityConfig, folder: Path, name: str, out: Path) -> It
 
 
 def _sample_frame(config: RealityConfig, frame: RebuiltFrame, detector: str) -> Iterator[RuleSample]:
-    """Sample around the certain failures of a frame, half of the states close to them, and all of its objects."""
+    """Sample around certain failures of a frame, half of the states close to them, and all of its objects."""
     identifier = frame.result.identifier
-    for failure, neighbourhood in frame.neighbourhoods(str(config.seed)):
+    for failure, neighbourhood in islice(frame.neighbourhoods(str(config.seed)), _MOST_FAILURES):
         index = failure.index or 0
         for k in range(config.samples):
             sample = neighbourhood.sample(k, 1.0 if k % 2 else NEAR_REACH)
