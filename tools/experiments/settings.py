@@ -217,13 +217,15 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     attacked: str = "squeezedet"
     """Detectors to attack, with commas."""
     drawn: Count = 24
-    """Sunny days on which weather is drawn, or that are attacked, at most."""
+    """Most sunny days of half B on which weather is drawn."""
     real: Count = 1000
     """Most real frames of each condition of half B."""
     real_a: Count = 24
     """The same of half A."""
-    attack_frames: Count = 8
-    """Sunny days of half A to attack."""
+    days_a: Count = 12
+    """Most sunny days of half A in which objects are sampled."""
+    attack_frames: Count = 4
+    """How many of them to attack; objects are sampled in all."""
     kitti_frames: Count = 2
     """Frames of --kitti-root to attack."""
     passes: Count = 30
@@ -231,7 +233,7 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     samples: Count = 24
     """Samples around each certain failure."""
     contrast: Count = 16
-    """Samples of each frame in which all objects change."""
+    """Samples of each day in which all objects change."""
     rules: Count = 5
     """Rules of each attacked detector."""
     detector: str = "squeezedet"

@@ -57,9 +57,10 @@ def measure_objects(picture: NDArray[np.uint8], boxes_xyxy: Floats) -> list[Obje
         # a box that fills the picture has no ring: the box stands for it
         around = _moments(sums, squares, grown, size_hw)
         ring = around - box if around[0] > box[0] else box
-        (lightness, contrast), (surround_lightness, surround_contrast) = _mean_and_deviation(
-            box
-        ), _mean_and_deviation(ring)
+        (lightness, contrast), (surround_lightness, surround_contrast) = (
+            _mean_and_deviation(box),
+            _mean_and_deviation(ring),
+        )
         values = (
             *(high, wide / max(high, 1e-6), (x0 + x1) / (2 * size_hw[1]), lightness, contrast),
             *(surround_lightness, surround_contrast, abs(lightness - surround_lightness)),
@@ -101,7 +102,9 @@ def find_hidden(boxes_xyxy: Floats, size_hw: tuple[int, int]) -> NDArray[np.bool
     """
     hidden = np.zeros(len(boxes_xyxy), bool)
     for i, (x0, y0, x1, y1) in enumerate(boxes_xyxy):
-        cut = x0 <= _EDGE_PX or y0 <= _EDGE_PX or x1 >= size_hw[1] - 1 - _EDGE_PX or y1 >= size_hw[0] - 1 - _EDGE_PX
+        cut = (
+            x0 <= _EDGE_PX or y0 <= _EDGE_PX or x1 >= size_hw[1] - 1 - _EDGE_PX or y1 >= size_hw[0] - 1 - _EDGE_PX
+        )
         nearer = boxes_xyxy[boxes_xyxy[:, 3] > y1]
         wide = np.minimum(nearer[:, 2], x1) - np.maximum(nearer[:, 0], x0)
         high = np.minimum(nearer[:, 3], y1) - np.maximum(nearer[:, 1], y0)

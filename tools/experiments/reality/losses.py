@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,18 +89,19 @@ def compute_losses(
     """
     plain_rows = [row for row in rows if row[0].source == PLAIN]
     names = list(dict.fromkeys(one.frame for one, _ in plain_rows))
-    weights = _draw_weights(len(names), draws, generator)
+    weights = draw_weights(len(names), draws, generator)
     plain = _count(plain_rows, detectors, weights)
     day = _count_real(rows, DAY, detectors, draws, generator)
     shares = day.objects[0]
     points: list[LossPoint] = []
     columns: dict[str, list[Floats]] = {source: [] for source in (REAL, DRAWN, PLACEBO)}
-    for condition in PREDICTED:
+    observed = {one.condition for one, _ in rows}
+    for condition in (name for name in PREDICTED if name in observed):
         real = _count_real(rows, condition, detectors, draws, generator)
         changed = {
             source: _count(_select(rows, condition, source), detectors, weights) for source in (DRAWN, PLACEBO)
         }
-        for low, high in zip(HEIGHTS_PX, HEIGHTS_PX[1:], strict=False):
+        for low, high in pairwise(HEIGHTS_PX):
             inside = np.array([low <= max(edge, HEIGHTS_PX[0]) < high for edge in HEIGHT_BINS_PX[:-1]])
             objects = int(real.objects[0, inside].sum()), int(changed[DRAWN].objects[0, inside].sum())
             if min(objects) < LEAST_OBJECTS:
@@ -130,10 +132,10 @@ def _count_real(
 ) -> _Counts:
     chosen = _select(rows, condition, REAL)
     frames = len({one.frame for one, _ in chosen})
-    return _count(chosen, detectors, _draw_weights(frames, draws, generator))
+    return _count(chosen, detectors, draw_weights(frames, draws, generator))
 
 
-def _draw_weights(frames: int, draws: int, generator: np.random.Generator) -> Floats:
+def draw_weights(frames: int, draws: int, generator: np.random.Generator) -> Floats:
     """How often each frame counts (1 + D, F): once, and in each draw."""
     drawn = generator.multinomial(frames, np.full(frames, 1 / max(frames, 1)), size=draws)
     return np.concatenate([np.ones((1, frames)), drawn])

@@ -73,7 +73,7 @@ def conditions_config(config: RealityConfig, half: str) -> ConditionsConfig:
         fog_root=config.fog_root,
         out=folder,
         half=half,
-        frames=config.drawn,
+        frames=config.drawn if half == "B" else config.days_a,
         real=config.real if half == "B" else config.real_a,
         detectors=config.detectors,
     )

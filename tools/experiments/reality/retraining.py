@@ -54,6 +54,8 @@ ARMS = {
     "worst": "counterexamples",
 }
 """Training arms: days without changes of colour, blur or noise; with them; and with drivesem's edits as well."""
+ARM_TITLES = {START: "before training"} | ARMS
+"""Titles of the tested detectors."""
 _UNCHANGED = AugmentSettings(
     brightness=0.0,
     contrast=0.0,

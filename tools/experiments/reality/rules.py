@@ -28,7 +28,7 @@ from tools.experiments.reality.observations import ADVERSE, REAL, Observation, f
 from tools.experiments.reality.samples import RuleSample
 
 RULE_FEATURES = tuple(name for name in FEATURES if name != "height_px")
-"""Features of rules; objects inside and outside are compared at equal heights, so that a rule of height says nothing."""
+"""Features of rules. Objects are compared at equal heights, where a rule of height alone says nothing."""
 _LABEL = "Car"
 
 
@@ -107,9 +107,7 @@ def _to_frames(
             share = FailureProbability(missed / len(near), *wilson(missed, len(near)), "samples", 0)
             fitted, fresh[name, number] = _to_samples(near[::2]), _to_samples(near[1::2])
             none = FeatureSamples((), (), ())
-            around.append(
-                FailureSamples(number, _LABEL, Kind.MISSED, Grade.CERTAIN, fitted, none, share)
-            )
+            around.append(FailureSamples(number, _LABEL, Kind.MISSED, Grade.CERTAIN, fitted, none, share))
         anywhere = [row for row in of_frame if not row[0].failure]
         numbers = tuple(one.number for one, _ in anywhere)
         contrast = (ContrastSamples(_LABEL, numbers, _to_samples(anywhere)),) if anywhere else ()

@@ -24,12 +24,14 @@ _UNRECORDED = ("part", "results", "half", "bootstrap", *PRESENTATION)
 def run_reality(config: RealityConfig) -> AnalysisReport | int:
     """Run a part of the experiment, or continue it. Raises UsageError or SceneError for bad input."""
     if config.part == "report":
-        from tools.experiments.reality.report import build_report
+        from tools.experiments.reality.report import DRAWS, build_report, load_results, write_plots
 
         folder = Path(config.results) if config.results is not None else Path(config.out or "") / RESULTS
-        report = build_report(folder, Path(config.out or folder), config.bootstrap, config.seed)
+        results = load_results(folder, DRAWS if config.bootstrap is None else config.bootstrap, config.seed)
+        report = build_report(results, Path(config.out or folder))
         if config.out is not None:
             report.write()
+            write_plots(results, report.out)
         return report
     out = Path(config.out or "")
     results = out / RESULTS
