@@ -224,15 +224,15 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     """The same of half A."""
     days_a: Count = 12
     """Most sunny days of half A in which objects are sampled."""
-    attack_frames: Count = 4
+    attack_frames: Count = 3
     """How many of them to attack; objects are sampled in all."""
     kitti_frames: Count = 2
     """Frames of --kitti-root to attack."""
     passes: Count = 30
     """Detector passes of each attack."""
-    samples: Count = 24
+    samples: Count = 16
     """Samples around each certain failure."""
-    contrast: Count = 16
+    contrast: Count = 12
     """Samples of each day in which all objects change."""
     rules: Count = 5
     """Rules of each attacked detector."""

@@ -195,10 +195,10 @@ def compare_losses(predicted: Floats, real: Floats) -> Agreement:
 
 
 def to_interval(name: str, values: Floats) -> Interval:
-    """The first value as the estimate, and the 95 % percentile interval of the others that are finite."""
+    """The first value as the estimate, and the 95 % percentile interval of the others, without what is not finite."""
     drawn = values[1:][np.isfinite(values[1:])]
     low, high = np.quantile(drawn, [0.025, 0.975]).tolist() if len(drawn) else (None, None)
-    return Interval(name, float(values[0]), low, high)
+    return Interval(name, float(values[0]) if np.isfinite(values[0]) else None, low, high)
 
 
 def _rank_correlation(one: Floats, other: Floats) -> float:

@@ -71,7 +71,7 @@ def plot_lifts(path: Path, names: Sequence[str], rules: Sequence[RuleLift], plac
         (placebos, 0.14, PLOT_COLOURS[1], "s", "placebo: random box of the same size"),
     ):
         for i, one in enumerate(lifts):
-            if one.lift.value is None or not np.isfinite(one.lift.value):
+            if one.lift.value is None:
                 continue
             ends = [one.lift.low or one.lift.value, one.lift.high or one.lift.value]
             axes.plot(ends, [i + shift] * 2, color=colour, linewidth=1.4)

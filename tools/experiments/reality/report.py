@@ -246,7 +246,7 @@ AGREEMENT = {
 
 def format_interval(interval: Interval, scale: float = 1.0, digits: int = 2) -> str:
     """Such as `0.61 [0.42, 0.75]`."""
-    if interval.value is None or not np.isfinite(interval.value):
+    if interval.value is None:
         return "-"
     text = f"{scale * interval.value:.{digits}f}"
     if interval.low is None or interval.high is None:
