@@ -224,7 +224,7 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     """The same of half A."""
     days_a: Count = 12
     """Most sunny days of half A in which objects are sampled."""
-    attack_frames: Count = 3
+    attack_frames: NotNegative = 3
     """How many of them to attack; objects are sampled in all."""
     kitti_frames: Count = 2
     """Frames of --kitti-root to attack."""

@@ -4,32 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivesem.analysis.holes.rules import (
-    ContrastSamples,
-    FailureSamples,
-    FailureWithRule,
-    FeatureSamples,
-    FrameHoles,
-    fit_rules,
-    merge_holes,
-)
-from drivesem.evaluation.resampling import Interval, wilson
-from drivesem.failures.failure_probability import FailureProbability
-from drivesem.failures.grades import Grade, Kind
-from drivesem.failures.rules import Floats, Intervals, contains
+from drivesem.evaluation.resampling import Interval
+from drivesem.failures.rules import Floats, Intervals, contains, description_length, fit_rule, fit_rule_list
 from tools.experiments.reality.features import FEATURES, ObjectFeatures
 from tools.experiments.reality.losses import HEIGHTS_PX, to_interval
 from tools.experiments.reality.observations import ADVERSE, REAL, Observation, frame_numbers, missed_flags
-from tools.experiments.reality.samples import RuleSample
+from tools.experiments.reality.samples import TABLE, RuleSample, read_samples
 
 RULE_FEATURES = tuple(name for name in FEATURES if name != "height_px")
 """Features of rules. Objects are compared at equal heights, where a rule of height alone says nothing."""
-_LABEL = "Car"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +29,8 @@ class TransferRule:
     """Name of the attacked detector."""
     where: Intervals
     """Interval of each feature."""
-    failures: int
-    """Certain failures that led to it."""
+    objects: int
+    """Sampled objects that are missed inside it."""
     placebo: Intervals
     """A random box of the same size in the space of features."""
 
@@ -49,7 +38,7 @@ class TransferRule:
         """Return a JSON object."""
         parts = {"where": self.where, "placebo": self.placebo}
         boxes = {key: {name: list(ends) for name, ends in box.items()} for key, box in parts.items()}
-        return {"detector": self.detector, "failures": self.failures, **boxes}
+        return {"detector": self.detector, "objects": self.objects, **boxes}
 
 
 def feature_columns(features: Sequence[ObjectFeatures]) -> dict[str, Floats]:
@@ -58,10 +47,10 @@ def feature_columns(features: Sequence[ObjectFeatures]) -> dict[str, Floats]:
 
 
 def choose_rules(samples: Sequence[RuleSample], detector: str, count: int, seed: int) -> list[TransferRule]:
-    """Fit rules to the samples of an attacked detector as `drivesem holes` does, and choose the largest.
+    """Fit rules to the samples of an attacked detector, with the fit that `drivesem holes` uses for several failures.
 
-    Every other sample around a failure is left out of the fit and tests its rule. Rules that do not separate failures
-    there are left out, too.
+    First comes the list of rules that predict misses of held-out objects. Then, for each feature that none of them
+    has, comes its best interval, those with the shortest description of the misses first.
 
     Args:
         samples: All samples.
@@ -70,54 +59,39 @@ def choose_rules(samples: Sequence[RuleSample], detector: str, count: int, seed:
         seed: Seed of the placebos.
     """
     own = [row for row in samples if row[0].detector == detector]
-    frames, fresh = _to_frames(own)
-    failures = {(name, one.index): one for name, frame in frames.items() for one in frame.around}
-    rules = fit_rules(frames)
-    holes = merge_holes({key: FailureWithRule(one, rules[key], fresh[key]) for key, one in failures.items()})
-    found = [hole for hole in holes if hole.where][:count]
-    generator = np.random.default_rng([seed, len(own)])
     columns = feature_columns([features for _, features in own])
-    return [
-        TransferRule(
-            detector,
-            _round(hole.where),
-            len(hole.failures),
-            _round(random_box(hole.where, columns, generator)),
-        )
-        for hole in found
-    ]
+    fitted = {name: columns[name] for name in RULE_FEATURES}
+    missed = np.array([one.missed for one, _ in own], bool)
+    keys = [(one.frame, one.number) for one, _ in own]
+    numbers = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    objects = np.array([numbers[key] for key in keys], np.int64)
+    if not missed.any():
+        return []
+    found = [rule.intervals for rule in fit_rule_list(fitted, missed, objects)]
+    unused = [name for name in RULE_FEATURES if not any(name in where for where in found)]
+    single = [fit_rule(fitted, missed, most=1, only=[name]).intervals for name in unused]
+    found += sorted(filter(None, single), key=lambda where: description_length(where, fitted, missed))
+    generator = np.random.default_rng([seed, len(own)])
+    rules = []
+    for where in found[:count]:
+        inside = contains(where, columns, len(own)) & missed
+        placebo = random_box(where, columns, generator)
+        rules.append(TransferRule(detector, _round(where), len(np.unique(objects[inside])), _round(placebo)))
+    return rules
+
+
+def fit_stored_rules(folder: Path, count: int, seed: int) -> list[TransferRule]:
+    """Rules of all detectors with samples in a folder, at most `count` of each."""
+    rules = []
+    for path in sorted(folder.glob(TABLE.format("*"))):
+        samples = read_samples(path)
+        for name in dict.fromkeys(one.detector for one, _ in samples):
+            rules += choose_rules(samples, name, count, seed)
+    return rules
 
 
 def _round(where: Intervals) -> Intervals:
     return {name: (round(low, 4), round(high, 4)) for name, (low, high) in where.items()}
-
-
-def _to_frames(
-    rows: Sequence[RuleSample],
-) -> tuple[dict[str, FrameHoles], dict[tuple[str, int], FeatureSamples]]:
-    """Samples in the form that `drivesem holes` fits rules to, and those that test them."""
-    frames: dict[str, FrameHoles] = {}
-    fresh: dict[tuple[str, int], FeatureSamples] = {}
-    for name in dict.fromkeys(one.frame for one, _ in rows):
-        of_frame = [row for row in rows if row[0].frame == name]
-        around = []
-        for number in sorted({one.number for one, _ in of_frame if one.failure}):
-            near = [row for row in of_frame if row[0].failure and row[0].number == number]
-            missed = sum(one.missed for one, _ in near)
-            share = FailureProbability(missed / len(near), *wilson(missed, len(near)), "samples", 0)
-            fitted, fresh[name, number] = _to_samples(near[::2]), _to_samples(near[1::2])
-            none = FeatureSamples((), (), ())
-            around.append(FailureSamples(number, _LABEL, Kind.MISSED, Grade.CERTAIN, fitted, none, share))
-        anywhere = [row for row in of_frame if not row[0].failure]
-        numbers = tuple(one.number for one, _ in anywhere)
-        contrast = (ContrastSamples(_LABEL, numbers, _to_samples(anywhere)),) if anywhere else ()
-        frames[name] = FrameHoles(name, "", tuple(around), contrast, 0, 0.0)
-    return frames, fresh
-
-
-def _to_samples(rows: Sequence[RuleSample]) -> FeatureSamples:
-    values = tuple(tuple(getattr(features, name) for name in RULE_FEATURES) for _, features in rows)
-    return FeatureSamples(RULE_FEATURES, values, tuple(-1.0 if one.missed else 1.0 for one, _ in rows))
 
 
 def random_box(where: Intervals, columns: Mapping[str, Floats], generator: np.random.Generator) -> Intervals:

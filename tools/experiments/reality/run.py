@@ -64,16 +64,14 @@ def run_reality(config: RealityConfig) -> AnalysisReport | int:
 
 def _fix_rules(config: RealityConfig, out: Path) -> str:
     """Choose the rules of all attacked detectors and write them. Returns the time."""
-    from tools.experiments.reality.rules import choose_rules
-    from tools.experiments.reality.samples import TABLE, read_samples
+    from tools.experiments.reality.rules import fit_stored_rules
 
     results = out / RESULTS
     if (results / RULES).is_file():
         raise UsageError("--out", "a folder without fixed rules", results / RULES)
-    files.write_bytes(results / TABLE, (out / TABLE).read_bytes())
-    samples = read_samples(results / TABLE)
-    names = dict.fromkeys(one.detector for one, _ in samples)
-    rules = [rule for name in names for rule in choose_rules(samples, name, config.rules, config.seed)]
+    rules = fit_stored_rules(results, config.rules, config.seed)
+    if not rules:
+        raise UsageError("--out", "samples of the part attack, and rules in them", results)
     files.write_json(results / RULES, [rule.to_json() for rule in rules])
     return _now()
 

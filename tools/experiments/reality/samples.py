@@ -27,7 +27,7 @@ from tools.bench.conditions import ConditionSets
 from tools.experiments.reality.features import ObjectFeatures, measure_objects
 from tools.experiments.reality.observations import conditions_config
 from tools.experiments.settings import RealityConfig
-from tools.experiments.tables import read_table, write_table
+from tools.experiments.tables import RESULTS, read_table, write_table
 
 PARAMS = "weather,color,translate,rotate"
 """What attacks may change."""
@@ -35,8 +35,8 @@ _MOST_FAILURES = 3
 """Failures of a frame that are sampled."""
 ATTACKS = "attacks"
 """Folder of the attacks' runs."""
-TABLE = "samples.csv.gz"
-"""File of the samples."""
+TABLE = "samples-{}.csv.gz"
+"""File of the samples of an attacked detector."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,17 +75,18 @@ def split_threshold(detector: str) -> tuple[str, float | None]:
 
 
 def attack_days(config: RealityConfig, out: Path) -> None:
-    """Attack sunny days of half A and KITTI with each of --attacked, sample objects, and write the table."""
+    """Attack sunny days of half A and KITTI with each of --attacked, sample objects, and write the tables."""
     sets = ConditionSets(conditions_config(config, "A"))
     days = sets.base()
     for name in days[: config.attack_frames]:
         if not (out / "scenes" / name).is_dir():
             with files.atomic_folder(out / "scenes" / name) as part:
                 save_scene(sets.scene(name).ir, part)
-    sources = {"bdd": (SCENES, str(out / "scenes"), config.attack_frames)}
+    sources = {}
+    if config.attack_frames:
+        sources["bdd"] = (SCENES, str(out / "scenes"), config.attack_frames)
     if config.kitti_root is not None:
         sources["kitti"] = ("kitti", config.kitti_root, config.kitti_frames)
-    rows: list[RuleSample] = []
     for text in config.attacked.split(","):
         spec, threshold = split_threshold(text.strip())
         attack = AttackConfig(
@@ -99,6 +100,7 @@ def attack_days(config: RealityConfig, out: Path) -> None:
             workers=1,
             seed=config.seed,
         )
+        rows: list[RuleSample] = []
         sampler = _Sampler(config, attack, short_name(spec), out / "sampled" / short_name(spec))
         for source, (dataset, root, limit) in sources.items():
             folder = out / ATTACKS / f"{sampler.name}-{source}"
@@ -107,7 +109,7 @@ def attack_days(config: RealityConfig, out: Path) -> None:
                 rows += sampler.around_failures(frame)
         for name in days:
             rows += sampler.anywhere(sets.scene(name).ir, name)
-    write_table(out / TABLE, (SampledObject, ObjectFeatures), rows)
+        write_table(out / RESULTS / TABLE.format(sampler.name), (SampledObject, ObjectFeatures), rows)
 
 
 class _Sampler:

@@ -47,7 +47,7 @@ def write_results(folder: Path) -> None:
         for one, features in rows
     ]
     write_table(folder / TABLE.format("B"), (ObservedObject, ObjectFeatures), rows)
-    rule = {"detector": "a", "failures": 3, "where": {"contrast": [0.0, 0.08]}, "placebo": {"across": [0.0, 0.4]}}
+    rule = {"detector": "a", "objects": 3, "where": {"contrast": [0.0, 0.08]}, "placebo": {"across": [0.0, 0.4]}}
     files.write_json(folder / "rules.json", [rule, rule | {"where": {"across": [0.4, 0.6]}}])
     frames = [RetrainTestFrame(condition, f"{condition}{i}", 2) for condition in (DAY, *ADVERSE) for i in range(4)]
     write_table(folder / OBJECTS, (RetrainTestFrame,), [(frame,) for frame in frames])
