@@ -46,7 +46,7 @@ FEATURES = tuple(field.name for field in fields(ObjectFeatures))
 def measure_objects(picture: NDArray[np.uint8], boxes_xyxy: Floats) -> list[ObjectFeatures]:
     """Measure vehicles in an RGB picture (H, W, 3); boxes (N, 4) px, clipped to the picture."""
     luma = picture.astype(np.float64) @ np.array(LUMA, np.float64) / 255
-    sums, squares = cv2.integral2(luma)
+    sums, squares = (np.asarray(table, np.float64) for table in cv2.integral2(luma))
     size_hw = picture.shape[:2]
     measured = []
     for x0, y0, x1, y1 in boxes_xyxy:

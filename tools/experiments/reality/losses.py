@@ -138,7 +138,7 @@ def _count_real(
 def draw_weights(frames: int, draws: int, generator: np.random.Generator) -> Floats:
     """How often each frame counts (1 + D, F): once, and in each draw."""
     drawn = generator.multinomial(frames, np.full(frames, 1 / max(frames, 1)), size=draws)
-    return np.concatenate([np.ones((1, frames)), drawn])
+    return np.concatenate([np.ones((1, frames)), drawn.astype(np.float64)])
 
 
 def _count(rows: Sequence[Observation], detectors: Sequence[str], weights: Floats) -> _Counts:

@@ -112,8 +112,9 @@ def _frames(sets: ConditionSets, half: str) -> Iterator[tuple[str, ConditionFram
 def _placebo(photograph: ConditionFrame, drawn: ConditionFrame) -> Picture:
     seed = hashlib.sha256(f"{drawn.condition}/{drawn.name}".encode()).digest()
     changed = change_as_much(photograph.read(), drawn.read(), np.random.default_rng(list(seed[:8])))
-    stored = np.frombuffer(encode_jpeg(changed), np.uint8)
-    return np.ascontiguousarray(cv2.imdecode(stored, cv2.IMREAD_COLOR)[..., ::-1]).astype(np.uint8)
+    stored = cv2.imdecode(np.frombuffer(encode_jpeg(changed), np.uint8), cv2.IMREAD_COLOR)
+    assert stored is not None
+    return np.ascontiguousarray(stored[..., ::-1]).astype(np.uint8)
 
 
 def change_as_much(photograph: Picture, other: Picture, generator: np.random.Generator) -> Picture:

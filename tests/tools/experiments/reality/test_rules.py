@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tools.experiments.reality.features import ObjectFeatures
+from tools.experiments.reality.losses import draw_weights
 from tools.experiments.reality.rules import RULE_FEATURES, choose_rules, feature_columns, measure_lift, random_box
 from tools.experiments.reality.samples import RuleSample, SampledObject
 
@@ -46,7 +47,7 @@ def test_strata_without_comparison_do_not_count() -> None:
 def test_intervals_follow_from_the_draws() -> None:
     inside, missed, stratum = expand((True, 0, 36, 40), (False, 0, 8, 40))
     frame = np.tile(np.arange(20), 4)
-    weights = np.concatenate([np.ones((1, 20)), np.random.default_rng(0).multinomial(20, np.full(20, 0.05), 300)])
+    weights = draw_weights(20, 300, np.random.default_rng(0))
     lift = measure_lift(inside, missed, stratum, frame, weights)
     assert lift.above
     assert lift.apart
