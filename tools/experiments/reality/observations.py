@@ -102,10 +102,11 @@ def _frames(sets: ConditionSets, half: str) -> Iterator[tuple[str, ConditionFram
         return
     plain = list(sets.drawn(UNDRAWN, {}))
     yield from ((PLAIN, frame) for frame in plain)
-    for name in PREDICTED:
-        drawn = list(sets.drawn(name, conditions[name].settings(full=False) or {}))
-        yield from ((DRAWN, frame) for frame in drawn)
-        for photograph, frame in zip(plain, drawn, strict=True):
+    drawn = {name: list(sets.drawn(name, conditions[name].settings(full=False) or {})) for name in PREDICTED}
+    for i, photograph in enumerate(plain):
+        for name in PREDICTED:
+            frame = drawn[name][i]
+            yield DRAWN, frame
             yield PLACEBO, replace(frame, read=partial(_placebo, photograph, frame))
 
 

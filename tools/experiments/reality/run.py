@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from drivesem.config.errors import UsageError
 from drivesem.reporting.tables import AnalysisReport
-from drivesem.run.folder import PRESENTATION
 from scene_ir import files
 from tools.experiments.settings import RealityConfig
 from tools.experiments.tables import METADATA, RESULTS
@@ -18,7 +17,10 @@ from tools.experiments.tables import METADATA, RESULTS
 RULES = "rules.json"
 """File of the fixed rules."""
 _SPLIT = "half A or B by the parity of the first byte of the SHA-256 of a frame's name without suffix"
-_UNRECORDED = ("part", "results", "half", "bootstrap", *PRESENTATION)
+_UNRECORDED = (
+    *("results", "bootstrap", "json", "out", "root", "fog_root", "kitti_root", "train_root", "half_a", "half_b"),
+)
+"""Settings that the record leaves out."""
 
 
 def run_reality(config: RealityConfig) -> AnalysisReport | int:
@@ -56,9 +58,8 @@ def run_reality(config: RealityConfig) -> AnalysisReport | int:
         from tools.experiments.reality.retraining import run_retraining
 
         run_retraining(config, out)
-    name = f"{config.part} {config.half}" if config.part == "observe" else config.part
-    seconds = {"wall": round(time.perf_counter() - start), "cpu": round(time.process_time() - cpu)}
-    _record(config, results, facts, {name: seconds})
+    seconds = {"wall_s": round(time.perf_counter() - start), "cpu_s": round(time.process_time() - cpu)}
+    _record(config, results, facts, seconds)
     return 0
 
 
@@ -83,12 +84,17 @@ def _now() -> str:
 def _record(
     config: RealityConfig, results: Path, facts: dict[str, Any], seconds: dict[str, Any] | None = None
 ) -> None:
-    """Add to the study's record; what was recorded first stays."""
+    """Add a part to the study's record; facts that were recorded first stay."""
     path = results / METADATA
-    record = files.read_json(path) if path.is_file() else {"split": _SPLIT, "settings": {}, "seconds": {}}
-    settings = {name: value for name, value in asdict(config).items() if name not in _UNRECORDED}
-    paths = ("root", "fog_root", "kitti_root", "train_root", "half_a", "half_b", "out")
-    changed = {name: value for name, value in settings.items() if name not in paths}
-    record["settings"] = {"name": "reality"} | changed
-    record["seconds"] |= seconds or {}
+    record = files.read_json(path) if path.is_file() else {"split": _SPLIT, "settings": {}, "parts": []}
+    record["settings"] = {"name": "reality", "seed": config.seed, "rules": config.rules}
+    if seconds is not None:
+        changed = {
+            field.name: value
+            for field in fields(config)
+            if field.name not in _UNRECORDED and (value := getattr(config, field.name)) != field.default
+        }
+        for name in {"detectors", "attacked"} & changed.keys():  # files without their folders
+            changed[name] = ",".join(part.rpartition("/")[2] for part in changed[name].split(","))
+        record["parts"].append(changed | seconds)
     files.write_json(path, facts | record)
