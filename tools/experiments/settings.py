@@ -218,6 +218,8 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     """Detectors to attack, with commas."""
     drawn: Count = 24
     """Most sunny days of half B on which weather is drawn."""
+    placebos: Count = 24
+    """How many of them get placebos."""
     real: Count = 1000
     """Most real frames of each condition of half B."""
     real_a: Count = 24

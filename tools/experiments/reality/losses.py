@@ -91,6 +91,9 @@ def compute_losses(
     names = list(dict.fromkeys(one.frame for one, _ in plain_rows))
     weights = draw_weights(len(names), draws, generator)
     plain = _count(plain_rows, detectors, weights)
+    with_placebo = {one.frame for one, _ in rows if one.source == PLACEBO}
+    # placebos are those of the first days
+    plain_of_placebos = _count([row for row in plain_rows if row[0].frame in with_placebo], detectors, weights)
     day = _count_real(rows, DAY, detectors, draws, generator)
     shares = day.objects[0]
     points: list[LossPoint] = []
@@ -108,7 +111,11 @@ def compute_losses(
                 continue
             for detector in detectors:
                 points.append(LossPoint(detector, condition, (low, high), objects))
-                pairs = ((REAL, day, real), (DRAWN, plain, changed[DRAWN]), (PLACEBO, plain, changed[PLACEBO]))
+                pairs = (
+                    (REAL, day, real),
+                    (DRAWN, plain, changed[DRAWN]),
+                    (PLACEBO, plain_of_placebos, changed[PLACEBO]),
+                )
                 for source, before, after in pairs:
                     recalls = (
                         average_recalls(c.hits[detector], c.objects, np.where(inside, shares, 0.0))[1]

@@ -80,11 +80,22 @@ def conditions_config(config: RealityConfig, half: str) -> ConditionsConfig:
 
 
 def observe_half(config: RealityConfig, half: str, path: Path) -> None:
-    """Observe the frames of a half and write the table; detections are stored in the half's folder."""
+    """Observe the frames of a half and write the table.
+
+    Detections are stored in the half's folder, observations of each picture in --out.
+    """
     settings = conditions_config(config, half)
     sets, detectors = ConditionSets(settings), load_detectors(settings.detectors)
     cache = ResultCache(Path(settings.out or "") / "detections")
-    rows = [row for pair in _frames(sets, half) for row in _observe(*pair, half, detectors, cache)]
+    names = "+".join(sorted(one.name for one in detectors))
+    rows: list[Observation] = []
+    for source, frame in _frames(sets, half, config.placebos):
+        folder = Path(config.out or "") / "observed" / names / source / frame.condition.replace(", ", "-")
+        stored = folder / f"{frame.name}.csv"
+        if not stored.is_file():
+            seen = list(_observe(source, frame, half, detectors, cache))
+            write_table(stored, (ObservedObject, ObjectFeatures), seen)
+        rows += read_observations(stored)
     write_table(path, (ObservedObject, ObjectFeatures), rows)
 
 
@@ -93,8 +104,8 @@ def read_observations(path: Path) -> list[Observation]:
     return [(one, features) for one, features in read_table(path, (ObservedObject, ObjectFeatures))]
 
 
-def _frames(sets: ConditionSets, half: str) -> Iterator[tuple[str, ConditionFrame]]:
-    """Sources and frames; drawn ones only of half B."""
+def _frames(sets: ConditionSets, half: str, placebos: int) -> Iterator[tuple[str, ConditionFrame]]:
+    """Sources and frames; drawn ones, and placebos of the first so many days, only of half B."""
     conditions = {condition.name: condition for condition in CONDITIONS}
     for name in (DAY, *ADVERSE):
         yield from ((REAL, frame) for frame in sets.real(conditions[name]))
@@ -107,7 +118,8 @@ def _frames(sets: ConditionSets, half: str) -> Iterator[tuple[str, ConditionFram
         for name in PREDICTED:
             frame = drawn[name][i]
             yield DRAWN, frame
-            yield PLACEBO, replace(frame, read=partial(_placebo, photograph, frame))
+            if i < placebos:
+                yield PLACEBO, replace(frame, read=partial(_placebo, photograph, frame))
 
 
 def _placebo(photograph: ConditionFrame, drawn: ConditionFrame) -> Picture:

@@ -1,5 +1,7 @@
 """Losses of recall, their agreement, and the placebo of equal size, on cases counted by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,14 @@ def test_placebo_changes_as_much(seed: int) -> None:
 def test_placebo_of_an_equal_picture_changes_nothing() -> None:
     photograph = np.random.default_rng(1).integers(0, 255, (20, 20, 3)).astype(np.uint8)
     assert (change_as_much(photograph, photograph, np.random.default_rng(0)) == photograph).all()
+
+
+def test_placebos_of_some_days_are_compared_with_those_days() -> None:
+    rows = observe(REAL, DAY, 2) + observe(REAL, "fog", 6) + observe(PLAIN, UNDRAWN, 1, frames=2)
+    worse = [
+        (replace(one, frame=f"{one.frame}x"), features) for one, features in observe(PLAIN, UNDRAWN, 9, frames=2)
+    ]
+    rows += worse + observe(DRAWN, "fog", 4, frames=4) + observe(PLACEBO, "fog", 3, frames=2)
+    losses = compute_losses(rows, ["a"], 5, np.random.default_rng(0))
+    assert losses.placebo[0].tolist() == pytest.approx([0.2])
+    assert losses.drawn[0].tolist() == pytest.approx([-0.1])
