@@ -4,8 +4,16 @@ from pathlib import Path
 
 from scene_ir import files
 from tools.bench.conditions import DAY, UNDRAWN, half_of
-from tools.experiments.reality.observations import ADVERSE, DRAWN, PLACEBO, PLAIN, PREDICTED, REAL, TABLE
-from tools.experiments.reality.observations import read_observations
+from tools.experiments.reality.observations import (
+    ADVERSE,
+    DRAWN,
+    PLACEBO,
+    PLAIN,
+    PREDICTED,
+    REAL,
+    TABLE,
+    read_observations,
+)
 from tools.experiments.reality.rules import fit_stored_rules
 
 STORED = Path(__file__).parents[4] / "docs" / "data" / "reality"
