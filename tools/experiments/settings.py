@@ -221,9 +221,11 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     placebos: Count = 24
     """How many of them get placebos."""
     real: Count = 1000
-    """Most real frames of each condition of half B."""
+    """Most real frames of each adverse condition of half B."""
+    real_days: Count = 1000
+    """Most real dry days of a half."""
     real_a: Count = 24
-    """The same of half A."""
+    """Most real frames of each adverse condition of half A."""
     days_a: Count = 12
     """Most sunny days of half A in which objects are sampled."""
     attack_frames: NotNegative = 3

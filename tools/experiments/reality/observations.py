@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -74,7 +75,7 @@ def conditions_config(config: RealityConfig, half: str) -> ConditionsConfig:
         out=folder,
         half=half,
         frames=config.drawn if half == "B" else config.days_a,
-        real=config.real if half == "B" else config.real_a,
+        real=max(config.real, config.real_days) if half == "B" else config.real_a,
         detectors=config.detectors,
     )
 
@@ -89,7 +90,7 @@ def observe_half(config: RealityConfig, half: str, path: Path) -> None:
     cache = ResultCache(Path(settings.out or "") / "detections")
     names = "+".join(sorted(one.name for one in detectors))
     rows: list[Observation] = []
-    for source, frame in _frames(sets, half, config.placebos):
+    for source, frame in _frames(sets, half, config):
         folder = Path(config.out or "") / "observed" / names / source / frame.condition.replace(", ", "-")
         stored = folder / f"{frame.name}.csv"
         if not stored.is_file():
@@ -104,11 +105,12 @@ def read_observations(path: Path) -> list[Observation]:
     return [(one, features) for one, features in read_table(path, (ObservedObject, ObjectFeatures))]
 
 
-def _frames(sets: ConditionSets, half: str, placebos: int) -> Iterator[tuple[str, ConditionFrame]]:
+def _frames(sets: ConditionSets, half: str, config: RealityConfig) -> Iterator[tuple[str, ConditionFrame]]:
     """Sources and frames; drawn ones, and placebos of the first so many days, only of half B."""
     conditions = {condition.name: condition for condition in CONDITIONS}
+    most = dict.fromkeys(ADVERSE, config.real if half == "B" else config.real_a) | {DAY: config.real_days}
     for name in (DAY, *ADVERSE):
-        yield from ((REAL, frame) for frame in sets.real(conditions[name]))
+        yield from ((REAL, frame) for frame in islice(sets.real(conditions[name]), most[name]))
     if half == "A":
         return
     plain = list(sets.drawn(UNDRAWN, {}))
@@ -118,7 +120,7 @@ def _frames(sets: ConditionSets, half: str, placebos: int) -> Iterator[tuple[str
         for name in PREDICTED:
             frame = drawn[name][i]
             yield DRAWN, frame
-            if i < placebos:
+            if i < config.placebos:
                 yield PLACEBO, replace(frame, read=partial(_placebo, photograph, frame))
 
 

@@ -202,7 +202,7 @@ def _train(
 
 def _test(config: RealityConfig, detectors: dict[tuple[str, int], Detector], out: Path) -> None:
     """Run the detectors on real frames of half B, and write what they detect."""
-    settings = conditions_config(replace(config, real=config.test), "B")
+    settings = conditions_config(replace(config, real=config.test, real_days=config.test), "B")
     sets = ConditionSets(settings)
     conditions = {condition.name: condition for condition in CONDITIONS}
     detections: list[tuple[ArmDetection]] = []
