@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from detectors.base import DetectorError
 from detectors.registry import read_weights, write_weights
 from detectors.training import CHECKPOINT, PRECISIONS, optimiser_state, restore_optimiser, split_by_section
-from drivesem.classify.networks.architectures import Classifier
+from drivesem.classify.networks.architectures import RENDERED_MEAN, RENDERED_STD, Classifier
 from drivesem.classify.networks.loading import load_for_training, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS
@@ -32,6 +32,7 @@ PICTURES = "pictures"
 RECORD = "training.json"
 _FREE = tuple(name for name in PRESENTATION if name != "limit")
 """Settings that may differ when training is continued; --limit selects the training data."""
+_MOMENTUM = 0.9
 _RATES = {"last": 3e-3, "all": 1e-4}
 _FEATURE_BATCH = 4
 """More is not faster on a CPU, where VGG-16's maps are so large that the system clears them each time."""
@@ -50,6 +51,8 @@ def train_classifier(config: ClassifyConfig) -> dict[str, Any]:
     torch.manual_seed(config.seed)  # dropout draws from torch's own
     random_weights = config.layers == "all"
     network = load_for_training(config.network, config.weights, classes, generator, random_weights)
+    if config.normalisation == "rendered":
+        network.normalise_by(RENDERED_MEAN, RENDERED_STD)
     network = network.to(config.device)
     claim_folder(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)
     folder = Path(config.data) if config.data else out / PICTURES
@@ -170,7 +173,7 @@ def _train(
     generator: torch.Generator,
     checkpoint: Path | None = None,
 ) -> _TrainingHistory:
-    """Train with Adam and a cosine schedule of the learning rate.
+    """Train with Adam and a cosine schedule of the learning rate, or with SGD at one rate.
 
     Args:
         module: The trained layers.
@@ -182,9 +185,13 @@ def _train(
         checkpoint: File that is written after each epoch, and continued from.
     """
     count = len(labels["train"])
-    optimiser = torch.optim.Adam(module.parameters(), lr=config.rate or _RATES[config.layers])
-    steps = config.epochs * -(-count // config.batch)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    rate, steps = config.rate or _RATES[config.layers], config.epochs * -(-count // config.batch)
+    if config.optimiser == "sgd":
+        optimiser: torch.optim.Optimizer = torch.optim.SGD(module.parameters(), lr=rate, momentum=_MOMENTUM)
+        schedule: torch.optim.lr_scheduler.LRScheduler = torch.optim.lr_scheduler.ConstantLR(optimiser, 1.0)
+    else:
+        optimiser = torch.optim.Adam(module.parameters(), lr=rate)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     state = _ClassifierTrainingState(module, optimiser, schedule, generator)
     curve = state.load(checkpoint) if checkpoint is not None and checkpoint.is_file() else []
     with progress_bar(Console(stderr=True)) as progress:
