@@ -169,13 +169,20 @@ def read_pictures(folder: Path, split: str, classes: tuple[str, ...]) -> tuple[T
     Raises:
         FormatError: A class without pictures, a damaged picture, or different sizes.
     """
-    images: list[np.ndarray] = []
+    paths: list[Path] = []
     labels: list[int] = []
     for label, name in enumerate(classes):
-        paths = sorted((folder / split / name).glob("*.png"))
-        if not paths:
+        own = sorted((folder / split / name).glob("*.png"))
+        if not own:
             raise FormatError(str(folder / split / name), "pictures of this class", "none")
-        for path in paths:
-            images.append(files.read_image(path, images[0].shape[:2] if images else None))  # type: ignore[arg-type]
-            labels.append(label)
-    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2), torch.tensor(labels)
+        paths += own
+        labels += [label] * len(own)
+    return read_images(paths), torch.tensor(labels)
+
+
+def read_images(paths: Sequence[Path]) -> Tensor:
+    """Read pictures of one size: RGB (N, 3, H, W) uint8. Raises FormatError."""
+    images: list[np.ndarray] = []
+    for path in paths:
+        images.append(files.read_image(path, images[0].shape[:2] if images else None))  # type: ignore[arg-type]
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -219,7 +220,9 @@ class ObjectSpace(ThetaSpace[ClassifyParameter]):
         pose = self.block(theta, ClassifyParameter.POSE)
         assert pose is not None
         composed = (rotation @ rotation_matrix(pose.expand(3))).double().cpu().numpy()
-        roll, pitch, yaw = Rotation.from_matrix(composed).as_euler("ZXY")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # at a pitch of 90 degrees it chooses a roll of 0
+            roll, pitch, yaw = Rotation.from_matrix(composed).as_euler("ZXY")
         moved[self.blocks[ClassifyParameter.POSE]] = moved.new_tensor([pitch, yaw, roll][: len(pose)])
         offsets = self.block(moved, ClassifyParameter.VERTEX)
         if offsets is not None:  # they turn too, about their mean

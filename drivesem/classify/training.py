@@ -67,7 +67,7 @@ def train_classifier(config: ClassifyConfig) -> dict[str, Any]:
         }
         curve, accuracy = train_last_layer(network, features, labels, config, generator)
     else:
-        curve, accuracy = _train_all_layers(network, images, labels, config, generator, out / CHECKPOINT)
+        curve, accuracy = train_all_layers(network, images, labels, config, generator, out / CHECKPOINT)
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
@@ -129,7 +129,7 @@ def train_last_layer(
     return history
 
 
-def _train_all_layers(
+def train_all_layers(
     network: Classifier,
     images: dict[str, Tensor],
     labels: dict[str, Tensor],
@@ -137,7 +137,16 @@ def _train_all_layers(
     generator: torch.Generator,
     checkpoint: Path,
 ) -> _TrainingHistory:
-    """Train all layers on pictures (N, 3, H, W) uint8 by split, each mirrored with probability 1/2."""
+    """Train all layers on pictures, each mirrored with probability 1/2.
+
+    Args:
+        network: The network.
+        images: Pictures (N, 3, H, W) uint8 by split: trained on `train`, evaluated on the others.
+        labels: Labels (N,) by split.
+        config: Settings.
+        generator: Generator of the order of samples.
+        checkpoint: File that is written after each epoch, and continued from.
+    """
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     dtype = PRECISIONS[config.precision]
 
