@@ -15,7 +15,7 @@ from scene_ir import files
 from tests.drivesem.classify.conftest import KINDS, ColourClassifier, SolidObjects
 from tools.experiments.__main__ import main
 from tools.experiments.classification import study as study_module
-from tools.experiments.classification.arms import STRATEGIES
+from tools.experiments.classification.arms import DIFFERENCES, STRATEGIES
 from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT, attack_pixels, has_pixel_attacks
 from tools.experiments.classification.study import TABLES, classify_features, retrain_last_layer
 
@@ -94,10 +94,13 @@ def test_pixels(two_networks, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(study_module, "attack_pixels", blue)
     monkeypatch.setattr(study_module, "has_pixel_attacks", lambda: True)
     words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--tables", "pixels")
+    words += ("--readings", "text")
     code, data, _ = study(capsys, *words, "--json")
     rows = data["tables"]["pixels"]["rows"]
     assert code == 0
-    assert [(row["network"], row["strategy"]) for row in rows] == [("one", name) for name in PIXEL_ATTACKS]
+    assert [(row["network"], row["strategy"]) for row in rows] == [
+        (network, name) for network in ("one", "two") for name in PIXEL_ATTACKS
+    ]
     assert all(row["overall"] == pytest.approx(1 / 3, abs=1e-4) for row in rows)  # the pole, which is blue
     assert all(row["distance"] > 0 for row in rows)
     monkeypatch.setattr(study_module, "has_pixel_attacks", lambda: False)
@@ -109,6 +112,7 @@ def test_pixels(two_networks, tmp_path, capsys, monkeypatch):
 @pytest.mark.slow
 def test_transfer(two_networks, tmp_path, capsys):
     words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--json")
+    words += ("--readings", "text")
     code, data, _ = study(capsys, *words, "--tables", "transfer")
     assert code == 0
     assert set(data["tables"]) == {"transfer"}
@@ -130,24 +134,29 @@ def test_transfer(two_networks, tmp_path, capsys):
 @pytest.mark.slow
 def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
-    words = ("--networks", two_networks, "--out", str(out), "--limit", "6", "--fresh", "3")
-    code, data, _ = study(capsys, *words, "--train-pictures", "12", "--json")
+    words = ("--networks", two_networks, "--out", str(out), "--limit", "6", "--fresh", "3", "--tables")
+    words += (",".join(TABLES), "--whole-pictures", "6")
+    code, data, printed = study(capsys, *words, "--train-pictures", "12", "--json")
     assert code == 0
+    assert "hours of one process" in printed
     tables = data["tables"]
     assert set(tables) == {*TABLES, "orders"}
     for name, table in tables.items():
         assert table["rows"] or (name == "pixels" and not has_pixel_attacks()), name
-        assert bool(table["reference"]) == (name not in ("orders", "pixels"))
-    assert data["pictures"] == {"test": 6, "train": 12, "retrained": 3}
+        assert bool(table["reference"]) == (name not in ("attribution", "orders", "pixels"))
+    assert data["pictures"] == {"test": 6, "train": 12, "retrained": 3, "whole": 6}
     rows = tables["degradation"]["rows"]
-    assert [row["strategy"] for row in rows] == 2 * ["benign", *STRATEGIES]
+    assert [row["strategy"] for row in rows] == 4 * ["benign", *STRATEGIES]
+    assert [row["network"] for row in rows[::8]] == ["one", "two", "one-code", "two-code"]
+    differences = {row["difference"] for row in tables["attribution"]["rows"] if row["network"] == "two"}
+    assert differences == set(DIFFERENCES)
     for row in rows:
         assert row["overall"] == pytest.approx(np.mean([row[kind] for kind in KINDS]), abs=1e-4)
         assert row["overall_low"] <= row["overall"] <= row["overall_high"]
     for table in ("retraining", "robustness"):
         assert [row["trained_on"] for row in tables[table]["rows"]][-3:] == ["si-fgsm", "sgd", "scw"]
     worth = {(r["network"], r["strategy"], r["membership"], r["weighted"]): r for r in tables["worth"]["rows"]}
-    assert len(worth) == 2 * 8 * 2 * 2
+    assert len(worth) == 4 * 8 * 2 * 2
     assert "gain" in worth["one", "sgd", "binary", True]
     assert {row["verdict"] for row in tables["orders"]["rows"]} <= {"holds", "reversed", "undecided"}
     assert len((out / "study.md").read_text().split("\n## ")) == len(tables) + 1
@@ -177,6 +186,7 @@ def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
     cases = {
         ("--tables", "accuracy"): "--tables: expected names among degradation, ",
         ("--networks", f"{one},{one}"): "--networks: expected networks with commas, each of another name",
+        ("--readings", "paper"): "--readings: expected names among text, code",
         ("--networks", "vgg16"): "--network: expected squeezenet, weights",
         ("--networks", str(tmp_path / "gone.safetensors")): "gone.safetensors",
         ("--backgrounds", str(tmp_path / "gone")): "--backgrounds: expected a folder of photographs",
