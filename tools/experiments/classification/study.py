@@ -100,7 +100,7 @@ _WRITTEN = (
     *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, ORDERS))),
     *(ARMS, RESULTS, FEATURES, RETRAINED, PICTURES),
 )
-_FREE_SETTINGS = (*PRESENTATION, "bootstrap", "tables", "networks", "fresh")
+_FREE_SETTINGS = (*PRESENTATION, "bootstrap", "tables", "readings", "networks", "fresh")
 """Settings that may differ when a study is continued: they add attacks, and change none."""
 _TEXT_COLUMNS = (
     *("network", "strategy", "trained on", "parameters", "settings", "made against", "tested on", "class"),
@@ -301,7 +301,7 @@ class ClassificationStudy:
     def _announce_hours(self, variants: Mapping[NetworkFeatures, set[str]]) -> None:
         """Attack two pictures on each network of the user, and print how long all others may take."""
         hours, count = 0.0, 0
-        for base in {one.text or one for one in self.networks}:
+        for base in dict.fromkeys(one.text or one for one in self.networks):
             shape = self._settings(base, GRADIENT_STRATEGIES[0])
             config = arm_config(self.study, self.out, f"{base.name}-timing", base.spec, **shape)
             arm = ClassificationArm(config, self.test[:2])
