@@ -260,7 +260,7 @@ def test_pictures_that_are_wrong_are_attacked_and_the_last_counts(monkeypatch, t
     assert data["top"]["benign"][0] == 0.0
     assert data["top"]["attacked"] == [1.0, 1.0, 1.0]
     page = (tmp_path / "code" / "report.html").read_text()
-    assert "predicted class, before the change" in page
+    assert "<h3>Before the change</h3>" in page
     assert "so not attacked" not in page
 
 

@@ -94,6 +94,12 @@ TRAINED = ("training", "normalisation", "lamp")
 """Differences for which a network is trained."""
 
 
+def attributed_strategies(difference: str, quick: bool) -> tuple[str, ...]:
+    """Strategies with which a difference, or CONTROL, is measured: all that it changes, or with --quick the first."""
+    strategies = GRADIENT_STRATEGIES if difference == CONTROL else DIFFERENCES[difference][1]
+    return strategies[:1] if quick else strategies
+
+
 @cache
 def code_settings(difference: str = "") -> Mapping[str, Any]:
     """Settings of the paper's code, or of one difference from its text."""

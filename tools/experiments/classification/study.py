@@ -44,6 +44,7 @@ from tools.experiments.classification.arms import (
     ClassificationArm,
     arm_config,
     attack_settings,
+    attributed_strategies,
     code_settings,
     run_classification_arms,
 )
@@ -92,7 +93,7 @@ _TABLE_STRATEGIES = {
 TABLES = tuple(_TABLE_STRATEGIES)
 _LONG_TABLES = ("parameters", "hyperparameters", "pixels")
 """Tables that --quick leaves out by default."""
-_SIZES = {"limit": (480, 12), "fresh": (232, 6), "train_pictures": (960, 24), "whole_pictures": (240, 12)}
+_SIZES = {"limit": (480, 12), "fresh": (232, 3), "train_pictures": (960, 12), "whole_pictures": (240, 12)}
 """Number of pictures by default and with --quick."""
 
 
@@ -246,7 +247,7 @@ class ClassificationStudy:
             settings = {} if difference == CONTROL else code_settings(difference)
             trained = difference in (*TRAINED, CONTROL)
             spec = self._variant_path(network, difference) if trained else network.spec
-            for strategy in GRADIENT_STRATEGIES if difference == CONTROL else DIFFERENCES[difference][1]:
+            for strategy in attributed_strategies(difference, self.study.quick):
                 attack = attack_settings(network.paper_network, strategy, settings)
                 name = f"{strategy}-with-{difference}"
                 self._add(f"with {difference}", network, strategy, self.test, name, **attack, network=spec)

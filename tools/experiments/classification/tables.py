@@ -24,6 +24,7 @@ from tools.experiments.classification.arms import (
     STRATEGIES,
     STRATEGY_NAMES,
     TRAINED,
+    attributed_strategies,
     paper_preset,
 )
 from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT
@@ -350,10 +351,10 @@ def _pixels(results: ClassificationResults) -> ResultTable:
 
 def _attribution(results: ClassificationResults) -> ResultTable:
     rows = []
-    for network, (difference, (_, strategies)) in product(results.facts.networks, DIFFERENCES.items()):
+    for network, difference in product(results.facts.networks, DIFFERENCES):
         if network.reading != "text" or (difference == "normalisation" and not network.takes_normalisation):
             continue
-        for strategy in strategies:
+        for strategy in attributed_strategies(difference, results.facts.settings.quick):
             arms = (f"with {CONTROL}" if difference in TRAINED else "test", f"with {difference}")
             before, after = (results.predictions("attacked", network, strategy, arm) for arm in arms)
             row: Row = {"network": network.name, "difference": difference, "strategy": strategy}
