@@ -71,7 +71,7 @@ def test_sizes_need_no_attack(two_networks, tmp_path, capsys):
         "train objects": 6,
         "val objects": 2,
         "test objects": 2,
-        "train pictures": 24,
+        "train pictures": 4,
         "test pictures": 1,
     }
     code, printed, _ = study(capsys, *words)
