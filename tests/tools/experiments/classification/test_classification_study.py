@@ -135,7 +135,7 @@ def test_transfer(two_networks, tmp_path, capsys):
 def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     words = ("--networks", two_networks, "--out", str(out), "--limit", "6", "--fresh", "3", "--tables")
-    words += (",".join(TABLES), "--whole-pictures", "6")
+    words += (",".join(TABLES), "--readings", "text", "--whole-pictures", "6")
     code, data, printed = study(capsys, *words, "--train-pictures", "12", "--json")
     assert code == 0
     assert "hours of one process" in printed
@@ -146,8 +146,7 @@ def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
         assert bool(table["reference"]) == (name not in ("attribution", "orders", "pixels"))
     assert data["pictures"] == {"test": 6, "train": 12, "retrained": 3, "whole": 6}
     rows = tables["degradation"]["rows"]
-    assert [row["strategy"] for row in rows] == 4 * ["benign", *STRATEGIES]
-    assert [row["network"] for row in rows[::8]] == ["one", "two", "one-code", "two-code"]
+    assert [row["strategy"] for row in rows] == 2 * ["benign", *STRATEGIES]
     differences = {row["difference"] for row in tables["attribution"]["rows"] if row["network"] == "two"}
     assert differences == set(DIFFERENCES)
     for row in rows:
@@ -156,7 +155,7 @@ def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     for table in ("retraining", "robustness"):
         assert [row["trained_on"] for row in tables[table]["rows"]][-3:] == ["si-fgsm", "sgd", "scw"]
     worth = {(r["network"], r["strategy"], r["membership"], r["weighted"]): r for r in tables["worth"]["rows"]}
-    assert len(worth) == 4 * 8 * 2 * 2
+    assert len(worth) == 2 * 8 * 2 * 2
     assert "gain" in worth["one", "sgd", "binary", True]
     assert {row["verdict"] for row in tables["orders"]["rows"]} <= {"holds", "reversed", "undecided"}
     assert len((out / "study.md").read_text().split("\n## ")) == len(tables) + 1
@@ -179,6 +178,57 @@ def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     code, _, output = study(capsys, *words, "--train-pictures", "24")
     assert code == 2
     assert "other values of train_pictures" in output
+
+
+@pytest.mark.slow
+def test_both_readings(two_networks, tmp_path, capsys, monkeypatch):
+    out, one = tmp_path / "out", two_networks.partition(",")[0]
+    sizes = ("--limit", "3", "--fresh", "3", "--train-pictures", "6", "--whole-pictures", "3")
+    words = (
+        "--networks",
+        one,
+        "--out",
+        str(out),
+        *sizes,
+        "--tables",
+        "degradation,retraining,robustness",
+        "--json",
+    )
+    save = study_module.save_classifier
+
+    def interrupt(*arguments):
+        monkeypatch.setattr(study_module, "save_classifier", save)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_module, "save_classifier", interrupt)
+    assert study(capsys, *words)[0] != 0
+    code, data, _ = study(capsys, *words)
+    assert code == 0
+    rows = data["tables"]["degradation"]["rows"]
+    assert [row["network"] for row in rows[::8]] == ["one", "one-code"]
+    for table in ("retraining", "robustness"):
+        assert {row["network"] for row in data["tables"][table]["rows"]} == {"one", "one-code"}
+    # The code's network has seen the coloured lamp and has its normalisation, and its attacks its settings.
+    network = loading.load_classifier(str(out / "retrained" / "one-code.safetensors"), KINDS)
+    assert network.mean.flatten().tolist() == pytest.approx([0.6109, 0.7387, 0.7765])
+    settings = [(out / "arms" / f"one{name}-scw" / "config.yaml").read_text() for name in ("", "-code")]
+    assert ["turns: compose" in text for text in settings] == [False, True]
+    first = next((out / "arms" / "one-scw" / "frames").iterdir()).name
+    pictures = [
+        files.read_image(out / "arms" / f"one{name}-scw" / "frames" / first / "benign.png")
+        for name in ("", "-code")
+    ]
+    assert (pictures[0] != pictures[1]).any()
+    # Another table adds arms, and repeats none.
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}
+    code, data, _ = study(capsys, *words[:-3], "--tables", "attribution", "--json")
+    assert code == 0
+    found = {row["difference"]: row for row in data["tables"]["attribution"]["rows"]}
+    assert set(found) == set(DIFFERENCES)
+    for row in found.values():
+        assert row["effect"] == pytest.approx(row["as_code"] - row["as_text"], abs=1e-4)
+        assert row["effect_low"] <= row["effect"] <= row["effect_high"]
+    assert all(path.stat().st_mtime_ns == at for path, at in before.items())
 
 
 def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
