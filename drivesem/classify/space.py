@@ -216,14 +216,13 @@ class ObjectSpace(ThetaSpace[ClassifyParameter]):
             return moved
         from scipy.spatial.transform import Rotation  # imported on use: it takes a third of a second to load
 
-        rotation = rotation_matrix(turn.expand(3))
-        pose = self.block(theta, ClassifyParameter.POSE)
-        assert pose is not None
-        composed = (rotation @ rotation_matrix(pose.expand(3))).double().cpu().numpy()
+        rotation = rotation_matrix(turn)
+        standing = rotation_matrix(theta[self.blocks[ClassifyParameter.POSE]])
+        composed = (rotation @ standing).double().cpu().numpy()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # at a pitch of 90 degrees it chooses a roll of 0
             roll, pitch, yaw = Rotation.from_matrix(composed).as_euler("ZXY")
-        moved[self.blocks[ClassifyParameter.POSE]] = moved.new_tensor([pitch, yaw, roll][: len(pose)])
+        moved[self.blocks[ClassifyParameter.POSE]] = moved.new_tensor([pitch, yaw, roll])
         offsets = self.block(moved, ClassifyParameter.VERTEX)
         if offsets is not None:  # they turn too, about their mean
             mean, rows = self._spread(offsets).mean(dim=0), offsets.reshape(-1, 3)
