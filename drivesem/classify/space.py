@@ -26,8 +26,8 @@ Turns = Literal["add", "compose"]
 """add: moves add Euler angles, about the object's centre; compose: each move turns the object as it stands, about the
 mean of its vertices, which move along the axes of the view. As in the paper's text, and in its code."""
 Lamp = Literal["white", "coloured"]
-"""white: a white lamp near the camera, whose strength and position change, with the environment; coloured: the lamp of
-the paper's code, far in front of the object, whose R, G and B change by themselves."""
+"""white: a white lamp near the camera; its strength and position change, and the environment; coloured: the lamp of the
+paper's code, far in front of the object; its R, G and B change by themselves."""
 LAMP_RGB = (20_000.0, 30_000.0, 20_000.0)
 """Intensity of the coloured lamp."""
 
@@ -137,8 +137,8 @@ class ObjectSpace(ThetaSpace[ClassifyParameter]):
             turns: How turns add up.
             one_turn: Whether pitch, yaw and roll are one number.
             lamp: The lamp whose light changes.
-            parts: Mesh part of each vertex (V,) int64, if each part is a group of its own; a part whose gradient is
-                not finite stays. None: all vertices are one group.
+            parts: Mesh part of each vertex (V,) int64, if each part is a group of its own; a part without a finite
+                gradient stays. None: all vertices are one group.
         """
         specs = {
             ClassifyParameter.VERTEX: _vertex_parameter(motion),
@@ -176,7 +176,7 @@ class ObjectSpace(ThetaSpace[ClassifyParameter]):
 
     @property
     def groups(self) -> tuple[ParameterGroup, ...]:
-        """Groups of coordinates whose gradients are normalised together."""
+        """Groups of coordinates: gradients are normalised within each."""
         whole = {str(p): [where] for p, where in self.blocks.items()}
         whole |= {ClassifyParameter.VERTEX: self._parts} if self._parts else {}
         owners = {str(p): self.owner_count(p) for p in self.blocks}
@@ -230,7 +230,7 @@ class ObjectSpace(ThetaSpace[ClassifyParameter]):
         return moved
 
     def settle_gradient(self, gradient: Tensor) -> Tensor:
-        """A gradient (D,) with 0 for mesh parts whose gradient is not finite. Raises RangeError for others."""
+        """A gradient (D,) with 0 for mesh parts where it is not finite. Raises RangeError for other coordinates."""
         for where in self._parts:
             if not bool(gradient[where].isfinite().all()):
                 gradient[where] = 0

@@ -858,8 +858,8 @@ class ClassifyConfig(FrameCommandConfig):
     """Turns of several steps: add pitch, yaw and roll, or compose, each about the mean of the vertices as they stand,
     as in the paper's code."""
     vertex_groups: Literal["object", "part"] = "object"
-    """Vertices whose gradient sgd and scw normalise together: all, or those of each mesh part (material), as in the
-    paper's code; a part whose gradient is not finite stays."""
+    """Gradients of vertices in sgd and scw are normalised over the object, or over each mesh part (material), as in the
+    paper's code; a part without a finite gradient stays."""
     attack_misclassified: Flag = False
     """Also attack pictures that are misclassified unchanged, and let the last iterate count, as in the paper's code."""
     method: Literal["si-fgsm", "sgd", "scw", "random", "halton"] = "si-fgsm"

@@ -148,7 +148,7 @@ def test_mesh_parts_are_normalised_apart():
     assert float(moved.norm()) == pytest.approx(0.01)  # all together: a step is a step of all
 
 
-def test_a_part_whose_gradient_is_not_finite_stays():
+def test_a_part_without_a_finite_gradient_stays():
     space = make_parts((1, 1, 0, 0), "vertex,pose")
     assert [(g.name, g.where, g.owners) for g in space.groups] == [
         ("vertex", slice(0, 6), 2),
