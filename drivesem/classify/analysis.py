@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from drivesem.classify.attack import Attacker
-from drivesem.classify.objective import ClassifierObjective, choose_loss
+from drivesem.classify.objective import ClassifierObjective, create_objective
 from drivesem.classify.pictures import ObjectView
 from drivesem.classify.results import SCHEMA, ClassifiedPicture
 from drivesem.config.commands import ClassifyConfig
@@ -82,7 +82,7 @@ class ClassifyRun:
         theta = torch.from_numpy(files.read_npz(path)["theta"]).to(space.theta0)
         if theta.shape != space.theta0.shape:
             raise FormatError(f"{path}: theta", f"shape {tuple(space.theta0.shape)}", tuple(theta.shape))
-        return ClassifierObjective(scene, space, attacker.network, choose_loss(self.config)), theta
+        return create_objective(scene, space, attacker.network, self.config), theta
 
 
 class FailureAnalyser(FrameAnalyser[K]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,13 +16,11 @@ from drivesem.attacks.methods.base import Attack
 from drivesem.classify.networks.architectures import ImageClassifier
 from drivesem.classify.networks.loading import open_network
 from drivesem.classify.objective import (
-    ClassifierObjective,
     ClassLogits,
     attacked_parameters,
-    choose_loss,
     create_attack,
-    parameter_bounds,
-    step_sizes,
+    create_objective,
+    create_space,
 )
 from drivesem.classify.pictures import ObjectRenderer, ObjectView, interleave_classes, parse_views
 from drivesem.classify.results import (
@@ -136,13 +134,16 @@ class Attacker:
             UsageError: Settings that cannot be used.
             SceneError: Objects or a network that cannot be used.
         """
-        renderer = ObjectRenderer.from_config(config) if shared is None else shared.renderer
+        own = shared is None
+        renderer = ObjectRenderer.from_config(config) if own else replace(shared.renderer, lamp=config.lamp)
         if shared is not None and shared.config.network == config.network:
             network = shared.network
         else:
             network = open_network(config.network, renderer.objects.classes, config.device)
         grader = PictureGrader(Nuisances.parse(config.nuisances), CertificateRule(config.draws), config.seed)
         attacked_parameters(config)
+        if config.target is not None and config.target not in network.classes:
+            raise UsageError("--target", f"one of {', '.join(network.classes)}", config.target)
         method = create_attack(config)
         if method.needs_gradient and not network.differentiable:
             raise UsageError("--method", f"random or halton: {config.network} has no gradient", config.method)
@@ -171,12 +172,13 @@ class Attacker:
 
     def load_scene(self, view: ObjectView) -> tuple[ObjectScene, ObjectSpace]:
         """Load a picture's scene and its parameters. Raises SceneError."""
-        config, scene = self.config, self.renderer.load_scene(view)
-        parameters = attacked_parameters(config), step_sizes(config), parameter_bounds(config)
-        return scene, ObjectSpace(scene.vertices, *parameters, config.shape)
+        scene = self.renderer.load_scene(view)
+        return scene, create_space(scene, self.config)
 
     def attack(self, view: ObjectView, out: Path) -> None:
-        """Attack a picture and write its folder; one that is misclassified unchanged is not attacked.
+        """Attack a picture and write its folder.
+
+        One that is misclassified unchanged is attacked only by the setting, one of the target class never.
 
         Args:
             view: The picture.
@@ -188,15 +190,16 @@ class Attacker:
         start = time.perf_counter()
         scene, space = self.load_scene(view)
         try:
-            objective = ClassifierObjective(scene, space, self.network, choose_loss(self.config))
-            wrong = not objective.benign.correct
-            search = None if wrong else self.method(objective.problem(), space.theta0, self.config.seed)
+            objective = create_objective(scene, space, self.network, self.config)
+            attackable = objective.benign.correct or self.config.attack_misclassified
+            attackable = attackable and scene.model.label != objective.target
+            search = self.method(objective.problem(), space.theta0, self.config.seed) if attackable else None
         except (RangeError, ShapeError) as error:
             raise type(error)(f"{view.identifier}: {error.field}", error.expected, error.actual) from error
         theta = space.theta0 if search is None else search.theta
         before, after = objective.render(space.theta0), objective.render(theta)
         attacked, passes = objective.evaluate(theta), objective.passes
-        failed, certificate = search is not None and not attacked.correct, None
+        failed, certificate = objective.benign.correct and not attacked.correct, None
         if failed and self.config.grade:
             certificate = self.grader.certify(scene.identifier, objective.classify, before, after)
         certain = certificate is not None and self.grader.rule.holds(certificate)
@@ -225,7 +228,8 @@ class Attacker:
 
 
 def _to_prediction(logits: ClassLogits, classes: tuple[str, ...]) -> ClassPrediction:
-    return ClassPrediction(classes[logits.predicted], round(logits.confidence, 6), round(logits.margin, 6))
+    confidence, margin = round(logits.confidence, 6), round(logits.margin, 6)
+    return ClassPrediction(classes[logits.predicted], confidence, margin, logits.rank)
 
 
 def attack_pictures(config: ClassifyConfig) -> ClassifyMetrics:

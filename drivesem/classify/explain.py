@@ -140,8 +140,8 @@ def theta_blocks(space: ObjectSpace) -> list[ThetaBlock]:
 
 
 def _angles_by_axis(space: ObjectSpace, theta: Tensor) -> dict[str, float]:
-    pose = space.block(theta, ClassifyParameter.POSE)
-    return {} if pose is None else dict(zip(AXES, (round(a, 6) for a in pose.tolist()), strict=True))
+    angles = space.change(theta).angles
+    return {} if angles is None else dict(zip(AXES, (round(a, 6) for a in angles.tolist()), strict=True))
 
 
 def explain_failures(config: ClassifyConfig) -> AnalysisReport:

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from drivesem.attacks.methods.base import GRADIENT_PASSES, Attack, ParameterGroup, Problem, Score
+from drivesem.attacks.methods.base import GRADIENT_PASSES, Attack, Problem, Score
 from drivesem.attacks.methods.gradient_ascent import SGD, SiFGSM
 from drivesem.attacks.methods.gradient_free import Sampling
 from drivesem.attacks.methods.scw import SCW
@@ -28,8 +28,9 @@ from scene_ir.io import round_to_8bit
 AttackLoss = Literal["logit", "hinge", "softmax"]
 """Loss that an attack maximises.
 
-logit: minus the true class's logit, as in the paper; hinge: minus the margin, where positive (Carlini and Wagner's f);
-softmax: the highest probability of a wrong class, by which the paper chooses among samples.
+logit: minus the true class's logit, as in the paper; hinge: minus the margin, where positive (Carlini and Wagner's f),
+or minus how far a target class lies below the highest other one; softmax: the highest probability of a wrong class, by
+which the paper chooses among samples.
 """
 
 
@@ -46,6 +47,11 @@ class ClassLogits:
     def predicted(self) -> int:
         """Index of the class with the highest logit; the first of equal ones."""
         return int(self.logits.argmax())
+
+    @property
+    def rank(self) -> int:
+        """Rank of the true class, from 1; of equal logits the first class is the better one."""
+        return int((self.logits.argsort(descending=True, stable=True) == self.label).nonzero()) + 1
 
     @property
     def correct(self) -> bool:
@@ -69,18 +75,20 @@ def class_margin(logits: Tensor, label: int) -> Tensor:
     return logits[label] - others.amax()
 
 
-def compute_attack_loss(logits: Tensor, label: int, loss: AttackLoss) -> Tensor:
+def compute_attack_loss(logits: Tensor, label: int, loss: AttackLoss, target: int | None = None) -> Tensor:
     """Compute the loss () that an attack maximises; differentiable.
 
     Args:
         logits: Logits of one picture (C,).
         label: Index of the true class.
         loss: Name of the loss.
+        target: Index of the class to predict, for hinge; None for any wrong one.
     """
     if loss == "logit":
         return -logits[label]
     if loss == "hinge":
-        return -class_margin(logits, label).clamp_min(0)
+        margin = class_margin(logits, label) if target is None else -class_margin(logits, target)
+        return -margin.clamp_min(0)
     probabilities = logits.softmax(0)
     return torch.cat([probabilities[:label], probabilities[label + 1 :]]).amax()
 
@@ -88,13 +96,26 @@ def compute_attack_loss(logits: Tensor, label: int, loss: AttackLoss) -> Tensor:
 class ClassifierObjective:
     """Loss, gradient and prediction of one picture as functions of theta (D,)."""
 
-    def __init__(self, scene: ObjectScene, space: ObjectSpace, network: ImageClassifier, loss: AttackLoss) -> None:
+    def __init__(
+        self,
+        scene: ObjectScene,
+        space: ObjectSpace,
+        network: ImageClassifier,
+        loss: AttackLoss,
+        *,
+        target: int | None = None,
+        constant: float | None = None,
+        final: bool = False,
+    ) -> None:
         """
         Args:
             scene: The object and its view.
             space: Its parameters.
             network: The network.
             loss: Name of the loss.
+            target: Index of the class to predict; None for any wrong one.
+            constant: Weight of the loss, from which the squares of theta are then subtracted; None: the loss alone.
+            final: Whether the last iterate counts, also of a picture that is misclassified unchanged.
 
         Raises:
             RangeError: Logits that are not finite.
@@ -103,6 +124,7 @@ class ClassifierObjective:
         self.space = space
         self.network = network
         self.loss: AttackLoss = loss
+        self.target, self.constant, self.final = target, constant, final
         self.passes = 0
         """Passes of the network so far; a gradient counts as GRADIENT_PASSES."""
         self._evaluated: dict[bytes, ClassLogits] = {}
@@ -111,15 +133,19 @@ class ClassifierObjective:
 
     def loss_and_grad(self, theta: Tensor) -> tuple[float, Tensor]:
         """Compute the loss and its gradient (D,). Raises RangeError if one is not finite."""
-        leaf = theta.detach().clone().requires_grad_(True)
-        image = self.scene.render(self.space.change(leaf))
-        loss = compute_attack_loss(self.network(image[None])[0], self.scene.model.label, self.loss)
+        move = torch.zeros_like(theta).requires_grad_(True)
+        image = self.scene.render(self.space.change(theta.detach(), move))
+        loss = self._compute_loss(self.network(image[None])[0], theta.detach() + move)
         if not bool(loss.isfinite()):
             raise RangeError(f"objective: {self.loss}", "a finite loss", float(loss.detach()))
-        (gradient,) = torch.autograd.grad(loss, leaf)
-        self.space.check_gradient(gradient)
+        gradient = self.space.settle_gradient(torch.autograd.grad(loss, move)[0])
         self.passes += GRADIENT_PASSES
         return float(loss.detach()), gradient
+
+    def _compute_loss(self, logits: Tensor, theta: Tensor) -> Tensor:
+        """The loss () of logits (C,) at theta (D,)."""
+        loss = compute_attack_loss(logits, self.scene.model.label, self.loss, self.target)
+        return loss if self.constant is None else self.constant * loss - theta.square().sum()
 
     @torch.no_grad()
     def render(self, theta: Tensor) -> Tensor:
@@ -140,10 +166,14 @@ class ClassifierObjective:
         return self._evaluated[key]
 
     def score(self, theta: Tensor) -> Score:
-        """Score theta (D,): a failure if the prediction was correct before and is not now."""
+        """Score theta (D,): a failure if the prediction was correct before and is not now, or is the target.
+
+        With `final`, a picture may be wrong before.
+        """
         prediction = self.evaluate(theta)
-        failed = self.benign.correct and not prediction.correct
-        loss = float(compute_attack_loss(prediction.logits, prediction.label, self.loss))
+        failed = not prediction.correct if self.target is None else prediction.predicted == self.target
+        failed = failed and (self.final or self.benign.correct)
+        loss = float(self._compute_loss(prediction.logits, theta))
         return Score(loss, lost=int(failed), phantoms=0, success=failed, success_paper=failed)
 
     def problem(self) -> Problem:
@@ -155,9 +185,9 @@ class ClassifierObjective:
             step=self.space.step,
             lower=self.space.lower,
             upper=self.space.upper,
-            groups=tuple(
-                ParameterGroup(str(p), where, self.space.owner_count(p)) for p, where in self.space.blocks.items()
-            ),
+            groups=self.space.groups,
+            advance=self.space.advance,
+            keep_last=self.final,
         )
 
 
@@ -177,6 +207,8 @@ _BOUNDS = {
     **dict.fromkeys(SAMPLING, ParameterAmounts(0.05, 0.75, 0.5)),
 }
 """The other methods are bounded by their few steps."""
+_SAMPLED_BOUNDS = ParameterAmounts(0.005, 0.3, 0.5)
+"""Of samples over vertices and one turn, in the paper's code."""
 
 
 def create_attack(config: ClassifyConfig) -> Attack:
@@ -185,6 +217,8 @@ def create_attack(config: ClassifyConfig) -> Attack:
         case "si-fgsm":
             return SiFGSM(config.steps, early_stop=True)
         case "sgd":
+            return SGD(config.steps, early_stop=True, form="unit")
+        case "scw" if config.scw_step == "unit":
             return SGD(config.steps, early_stop=True, form="unit")
         case "scw":
             return SCW(config.steps, config.steps, config.norm, early_stop=True, constant=config.constant)
@@ -199,9 +233,45 @@ def choose_loss(config: ClassifyConfig) -> AttackLoss:
     return "hinge" if config.method == "scw" else "logit"
 
 
+def create_objective(
+    scene: ObjectScene, space: ObjectSpace, network: ImageClassifier, config: ClassifyConfig
+) -> ClassifierObjective:
+    """Create the objective of an attack. Raises RangeError for logits that are not finite."""
+    unit = config.method == "scw" and config.scw_step == "unit"
+    return ClassifierObjective(
+        scene,
+        space,
+        network,
+        choose_loss(config),
+        target=None if config.target is None else network.classes.index(config.target),
+        constant=config.constant if unit else None,
+        final=config.attack_misclassified and config.method not in SAMPLING,
+    )
+
+
+def create_space(scene: ObjectScene, config: ClassifyConfig) -> ObjectSpace:
+    """Create the parameters of an object's attack. Raises FormatError."""
+    return ObjectSpace(
+        scene.vertices,
+        attacked_parameters(config),
+        step_sizes(config),
+        parameter_bounds(config),
+        config.shape,
+        turns=config.turns,
+        one_turn=_samples_vertices(config),
+        lamp=config.lamp,
+        parts=scene.model.vertex_parts() if config.vertex_groups == "part" else None,
+    )
+
+
+def _samples_vertices(config: ClassifyConfig) -> bool:
+    return config.method in SAMPLING and config.sampled == "vertex,turn"
+
+
 def attacked_parameters(config: ClassifyConfig) -> tuple[ClassifyParameter, ...]:
     """The attacked parameters. Raises FormatError."""
-    return parse_parameters(config.params or ("pose" if config.method in SAMPLING else "pose,vertex"))
+    pose_alone = config.method in SAMPLING and not _samples_vertices(config)
+    return parse_parameters(config.params or ("pose" if pose_alone else "pose,vertex"))
 
 
 def step_sizes(config: ClassifyConfig) -> ParameterAmounts:
@@ -211,7 +281,8 @@ def step_sizes(config: ClassifyConfig) -> ParameterAmounts:
 
 def parameter_bounds(config: ClassifyConfig) -> ParameterAmounts:
     """The bound of each parameter."""
-    return _override_defaults(_BOUNDS.get(config.method, WIDEST_BOUNDS), config, "within")
+    defaults = _SAMPLED_BOUNDS if _samples_vertices(config) else _BOUNDS.get(config.method, WIDEST_BOUNDS)
+    return _override_defaults(defaults, config, "within")
 
 
 def _override_defaults(defaults: ParameterAmounts, config: ClassifyConfig, prefix: str) -> ParameterAmounts:

@@ -15,6 +15,7 @@ from torch import Tensor
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectModel, ObjectSet, Split
 from drivesem.classify.scenes import VIEWS, ObjectScene, open_backgrounds
+from drivesem.classify.space import Lamp
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
@@ -50,18 +51,20 @@ class ObjectRenderer:
     """Returns a picture's background by its name."""
     load_model: Callable[[str], ObjectModel]
     """Loads an object by name."""
+    lamp: Lamp = "white"
+    """The lamp."""
 
     @classmethod
     def from_config(cls, config: ClassifyConfig) -> ObjectRenderer:
         """Open objects and backgrounds. Raises SceneError if they cannot be used."""
         objects = open_objects(config.objects)
         # Cache the last object, since its views follow each other.
-        return cls(objects, open_backgrounds(config.backgrounds), lru_cache(maxsize=1)(objects.load))
+        return cls(objects, open_backgrounds(config.backgrounds), lru_cache(maxsize=1)(objects.load), config.lamp)
 
     def load_scene(self, view: ObjectView) -> ObjectScene:
         """Load the scene of a view. Raises SceneError for the object's or the background's file."""
         model = self.load_model(view.name)
-        return ObjectScene(view.identifier, model, view.view, self.backgrounds(view.identifier))
+        return ObjectScene(view.identifier, model, view.view, self.backgrounds(view.identifier), self.lamp)
 
     @torch.no_grad()
     def write_picture(self, view: ObjectView, out: Path) -> None:
@@ -166,13 +169,20 @@ def read_pictures(folder: Path, split: str, classes: tuple[str, ...]) -> tuple[T
     Raises:
         FormatError: A class without pictures, a damaged picture, or different sizes.
     """
-    images: list[np.ndarray] = []
+    paths: list[Path] = []
     labels: list[int] = []
     for label, name in enumerate(classes):
-        paths = sorted((folder / split / name).glob("*.png"))
-        if not paths:
+        own = sorted((folder / split / name).glob("*.png"))
+        if not own:
             raise FormatError(str(folder / split / name), "pictures of this class", "none")
-        for path in paths:
-            images.append(files.read_image(path, images[0].shape[:2] if images else None))  # type: ignore[arg-type]
-            labels.append(label)
-    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2), torch.tensor(labels)
+        paths += own
+        labels += [label] * len(own)
+    return read_images(paths), torch.tensor(labels)
+
+
+def read_images(paths: Sequence[Path]) -> Tensor:
+    """Read pictures of one size: RGB (N, 3, H, W) uint8. Raises FormatError."""
+    images: list[np.ndarray] = []
+    for path in paths:
+        images.append(files.read_image(path, images[0].shape[:2] if images else None))  # type: ignore[arg-type]
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,7 +22,9 @@ from drivesem.run.records import load_record
 from drivesem.run.run_report import PAGE
 from scene_ir import files
 
-SCHEMA = 1
+SCHEMA = 2
+TOP = 3
+"""Highest k of the top-k accuracies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,8 @@ class ClassPrediction:
     """Its softmax, in [0, 1]."""
     margin: float
     """Logit of the true class minus the highest other one."""
+    rank: int
+    """Rank of the true class, from 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +133,8 @@ class ClassCounts:
     """Correct before the change."""
     attacked: int
     """Correct after it."""
+    failures: int
+    """Correct before the change and wrong after it."""
     certain: int
     """Failures of grade certain or above."""
     confirmed: int = 0
@@ -156,6 +163,10 @@ class ClassifyMetrics:
     """Attacked parameters."""
     classes: tuple[ClassCounts, ...]
     """Counts by class."""
+    top: dict[str, tuple[float, ...]]
+    """Top-1 to top-3 accuracy in [0, 1], benign and attacked; empty without pictures."""
+    confusion: dict[str, tuple[tuple[int, ...], ...]]
+    """Pictures by true class (rows) and predicted class, benign and attacked."""
     frames_failed: dict[str, str]
     """Reason by picture without a result."""
     queries: int
@@ -183,10 +194,28 @@ class ClassifyMetrics:
             attacked = sum(result.correct_after for result in own)
             confirmed = sum(result.grade == Grade.CONFIRMED for result in own)
             certain = confirmed + sum(result.grade == Grade.CERTAIN for result in own)
-            return ClassCounts(name, len(own), benign, attacked, certain, confirmed)
+            failures = sum(result.grade is not None for result in own)
+            return ClassCounts(name, len(own), benign, attacked, failures, certain, confirmed)
 
+        sides = {side: [getattr(result, side) for result in results] for side in ("benign", "attacked")}
+        confusion = {
+            side: Counter(zip((r.label for r in results), (one.predicted for one in predictions), strict=True))
+            for side, predictions in sides.items()
+        }
         return cls(
             classes=tuple(count(name) for name in classes),
+            top={
+                side: tuple(
+                    round(sum(one.rank <= k for one in predictions) / len(predictions), 4)
+                    for k in range(1, TOP + 1)
+                    if predictions
+                )
+                for side, predictions in sides.items()
+            },
+            confusion={
+                side: tuple(tuple(counts[true, predicted] for predicted in classes) for true in classes)
+                for side, counts in confusion.items()
+            },
             queries=sum(result.queries for result in results),
             passes=sum(result.passes for result in results),
             **facts,
@@ -195,14 +224,14 @@ class ClassifyMetrics:
     @property
     def overall(self) -> ClassCounts:
         """Counts over all classes."""
-        counts = ("pictures", "benign", "attacked", "certain", "confirmed")
+        counts = ("pictures", "benign", "attacked", "failures", "certain", "confirmed")
         return ClassCounts("all", *(sum(getattr(one, name) for one in self.classes) for name in counts))
 
     @property
     def grades(self) -> dict[str, int]:
         """Number of failures of at least each grade."""
         overall = self.overall
-        counts = (overall.benign - overall.attacked, overall.certain, overall.confirmed)
+        counts = (overall.failures, overall.certain, overall.confirmed)
         return dict(zip(map(str, (Grade.THRESHOLD, Grade.CERTAIN, Grade.CONFIRMED)), counts, strict=True))
 
     def to_json(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from drivesem.classify.objects.types import ObjectModel
-from drivesem.classify.space import ObjectChange
+from drivesem.classify.space import LAMP_RGB, Lamp, ObjectChange, rotation_matrix
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.render.lit_mesh import Lights, LitMesh, Materials, composite_over
@@ -33,6 +33,8 @@ _FOCAL = 1.85
 _LAMP_POSITION = (0.5, -0.8, 0.2)
 """Position of the lamp in camera space: to the right of the camera and above it."""
 _STRENGTH, _ENVIRONMENT = 0.85, 0.3
+_FAR = 100.0
+"""Distance of the coloured lamp before the object, in object sizes."""
 _OBJECT_TO_CAMERA = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 """From the object's axes (y up, front towards -z) to camera space, seen from the front."""
 
@@ -53,6 +55,8 @@ class ObjectScene:
     """Key of `VIEWS`."""
     background: Tensor
     """RGB in [0, 1], (3, DRAWN_PX, DRAWN_PX)."""
+    lamp: Lamp = "white"
+    """The lamp; neither casts shadows."""
 
     @cached_property
     def mesh(self) -> LitMesh:
@@ -71,13 +75,25 @@ class ObjectScene:
         change = change or ObjectChange()
         vertices = self.vertices if change.offsets is None else self.vertices + change.offsets
         angles = vertices.new_tensor([*VIEWS[self.view], 0.0])
-        angles = angles if change.angles is None else angles + change.angles
-        turned = vertices @ (rotation_matrix(angles) @ vertices.new_tensor(_OBJECT_TO_CAMERA)).T
+        to_camera = vertices.new_tensor(_OBJECT_TO_CAMERA)
+        if change.turns == "add":
+            angles = angles if change.angles is None else angles + change.angles
+            turned = vertices @ (rotation_matrix(angles) @ to_camera).T
+        else:
+            turned = self.vertices @ (rotation_matrix(angles) @ to_camera).T
+            turned = turned if change.angles is None else _turn_about_mean(turned, change.angles)
+            turned = turned if change.offsets is None else turned + change.offsets
+            turned = turned if change.next_turn is None else _turn_about_mean(turned, change.next_turn)
         return turned + vertices.new_tensor([0.0, 0.0, DISTANCE])
 
     def lights(self, change: ObjectChange | None = None) -> Lights:
-        """The lights after a change."""
+        """The lights after a change; the coloured lamp's strength is (3, 1), of R, G and B."""
         light = self.vertices.new_zeros(5) if change is None or change.light is None else change.light
+        if self.lamp == "coloured":
+            colour = light.new_tensor(LAMP_RGB) * 3 / sum(LAMP_RGB)
+            strength = _STRENGTH * colour * (1 + light[:3])
+            far = light.new_tensor([0.0, 0.0, DISTANCE - _FAR])
+            return Lights(far, strength[:, None], light.new_tensor(_ENVIRONMENT), _FAR)
         lamp = light.new_tensor(_LAMP_POSITION) + light[2:]
         return Lights(lamp, _STRENGTH * (1 + light[0]), _ENVIRONMENT * (1 + light[1]), DISTANCE)
 
@@ -154,17 +170,10 @@ def picture_camera(size: int = DRAWN_PX) -> Camera:
     return Camera(torch.tensor([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]), size, size)
 
 
-def rotation_matrix(angles: Tensor) -> Tensor:
-    """Compute the rotation (3, 3) by pitch, yaw and roll (3,), rad.
-
-    Yaw acts first, then pitch, then roll, about the camera's axes; with positive pitch the top is visible.
-    """
-    (cp, cy, cr), (sp, sy, sr) = angles.cos(), angles.sin()
-    zero, one = torch.zeros_like(cp), torch.ones_like(cp)
-    pitch = torch.stack([one, zero, zero, zero, cp, -sp, zero, sp, cp]).reshape(3, 3)
-    yaw = torch.stack([cy, zero, sy, zero, one, zero, -sy, zero, cy]).reshape(3, 3)
-    roll = torch.stack([cr, -sr, zero, sr, cr, zero, zero, zero, one]).reshape(3, 3)
-    return roll @ pitch @ yaw
+def _turn_about_mean(vertices: Tensor, angles: Tensor) -> Tensor:
+    """Turn vertices (V, 3) by pitch, yaw and roll (3,), rad, about their mean."""
+    mean = vertices.mean(dim=0)
+    return mean + (vertices - mean) @ rotation_matrix(angles).T
 
 
 def open_backgrounds(folder: str | None) -> _Backgrounds:

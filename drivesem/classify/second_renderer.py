@@ -88,6 +88,11 @@ class SecondObjectRenderer(Protocol):
         ...
 
 
+def _lamp_rgb(lights: Lights) -> Array:
+    """Strength of the lamp in R, G and B (3,)."""
+    return lights.strength.detach().reshape(-1).expand(3).numpy()
+
+
 def open_second_renderer(name: str) -> SecondObjectRenderer:
     """Open mitsuba, pyrender, or auto: Mitsuba if it is installed. Raises NoSecondRendererError."""
     if name != "pyrender":
@@ -152,7 +157,10 @@ class MitsubaRenderer:
                 "lamp": {
                     "type": "point",
                     "position": lights.point.tolist(),
-                    "intensity": {"type": "rgb", "value": math.pi * float(lights.strength) * lights.reach**2},
+                    "intensity": {
+                        "type": "rgb",
+                        "value": (math.pi * lights.reach**2 * _lamp_rgb(lights)).tolist(),
+                    },
                 },
                 "sky": self._sky(float(lights.environment)),
                 "object": self._mesh(posed),
@@ -265,18 +273,20 @@ class PyrenderRenderer:
         lights, size = posed.lights, (posed.camera.height, posed.camera.width)
         window = ImageWindow(0, 0, size[1], size[0])
         intrinsics = posed.camera.matrix.numpy()[:3, :3]
-        intensity = math.pi * float(lights.strength) * lights.reach**2
+        colour = _lamp_rgb(lights)
+        intensity = math.pi * float(colour.max()) * lights.reach**2
+        tint = colour / colour.max()  # of the surfaces, as pyrender's lamps are white
         diffuse, specular, shininess = (
             np.repeat(values, 3, axis=0) for values in (posed.diffuse, posed.specular, posed.shininess)
         )
         around = float(lights.environment) * (1 - UPWARD_SHARE * posed.normals[:, 1:2])
         sky = np.clip((diffuse + MIRRORED_SHARE * specular[:, None]) * around, 0, 1)
-        matt = [PaintLayer(posed.points, posed.normals, diffuse / np.float32(_MATT), 1.0, 0.0)]
+        matt = [PaintLayer(posed.points, posed.normals, tint * diffuse / np.float32(_MATT), 1.0, 0.0)]
         ambient = [PaintLayer(posed.points, posed.normals, (sky**GAMMA).astype(np.float32), 1.0, 0.0)]
         glossy = []
         for exponent in np.unique(shininess):
             same = shininess == exponent
-            height = np.repeat(specular[same, None] * 8 / (exponent + 2), 3, axis=1)
+            height = tint * specular[same, None] * 8 / (exponent + 2)
             rough = float((2 / (exponent + 2)) ** 0.25)
             layer = posed.points[same], posed.normals[same], height.astype(np.float32)
             glossy.append(PaintLayer(*layer, rough, 1.0))

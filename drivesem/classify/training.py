@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from detectors.base import DetectorError
 from detectors.registry import read_weights, write_weights
 from detectors.training import CHECKPOINT, PRECISIONS, optimiser_state, restore_optimiser, split_by_section
-from drivesem.classify.networks.architectures import Classifier
+from drivesem.classify.networks.architectures import RENDERED_MEAN, RENDERED_STD, Classifier
 from drivesem.classify.networks.loading import load_for_training, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS
@@ -32,6 +32,7 @@ PICTURES = "pictures"
 RECORD = "training.json"
 _FREE = tuple(name for name in PRESENTATION if name != "limit")
 """Settings that may differ when training is continued; --limit selects the training data."""
+_MOMENTUM = 0.9
 _RATES = {"last": 3e-3, "all": 1e-4}
 _FEATURE_BATCH = 4
 """More is not faster on a CPU, where VGG-16's maps are so large that the system clears them each time."""
@@ -50,6 +51,8 @@ def train_classifier(config: ClassifyConfig) -> dict[str, Any]:
     torch.manual_seed(config.seed)  # dropout draws from torch's own
     random_weights = config.layers == "all"
     network = load_for_training(config.network, config.weights, classes, generator, random_weights)
+    if config.normalisation == "rendered":
+        network.normalise_by(RENDERED_MEAN, RENDERED_STD)
     network = network.to(config.device)
     claim_folder(out, config, (f"{config.network}.safetensors", RECORD, PICTURES, CHECKPOINT), _FREE)
     folder = Path(config.data) if config.data else out / PICTURES
@@ -64,7 +67,7 @@ def train_classifier(config: ClassifyConfig) -> dict[str, Any]:
         }
         curve, accuracy = train_last_layer(network, features, labels, config, generator)
     else:
-        curve, accuracy = _train_all_layers(network, images, labels, config, generator, out / CHECKPOINT)
+        curve, accuracy = train_all_layers(network, images, labels, config, generator, out / CHECKPOINT)
     path = out / f"{config.network}.safetensors"
     facts = {"accuracy": json.dumps(accuracy), "objects": config.objects or "embedded"}
     save_classifier(network, path, facts)
@@ -126,7 +129,7 @@ def train_last_layer(
     return history
 
 
-def _train_all_layers(
+def train_all_layers(
     network: Classifier,
     images: dict[str, Tensor],
     labels: dict[str, Tensor],
@@ -134,7 +137,16 @@ def _train_all_layers(
     generator: torch.Generator,
     checkpoint: Path,
 ) -> _TrainingHistory:
-    """Train all layers on pictures (N, 3, H, W) uint8 by split, each mirrored with probability 1/2."""
+    """Train all layers on pictures, each mirrored with probability 1/2.
+
+    Args:
+        network: The network.
+        images: Pictures (N, 3, H, W) uint8 by split: trained on `train`, evaluated on the others.
+        labels: Labels (N,) by split.
+        config: Settings.
+        generator: Generator of the order of samples.
+        checkpoint: File that is written after each epoch, and continued from.
+    """
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     dtype = PRECISIONS[config.precision]
 
@@ -170,7 +182,7 @@ def _train(
     generator: torch.Generator,
     checkpoint: Path | None = None,
 ) -> _TrainingHistory:
-    """Train with Adam and a cosine schedule of the learning rate.
+    """Train with Adam and a cosine schedule of the learning rate, or with SGD at one rate.
 
     Args:
         module: The trained layers.
@@ -182,9 +194,13 @@ def _train(
         checkpoint: File that is written after each epoch, and continued from.
     """
     count = len(labels["train"])
-    optimiser = torch.optim.Adam(module.parameters(), lr=config.rate or _RATES[config.layers])
-    steps = config.epochs * -(-count // config.batch)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    rate, steps = config.rate or _RATES[config.layers], config.epochs * -(-count // config.batch)
+    if config.optimiser == "sgd":
+        optimiser: torch.optim.Optimizer = torch.optim.SGD(module.parameters(), lr=rate, momentum=_MOMENTUM)
+        schedule: torch.optim.lr_scheduler.LRScheduler = torch.optim.lr_scheduler.ConstantLR(optimiser, 1.0)
+    else:
+        optimiser = torch.optim.Adam(module.parameters(), lr=rate)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     state = _ClassifierTrainingState(module, optimiser, schedule, generator)
     curve = state.load(checkpoint) if checkpoint is not None and checkpoint.is_file() else []
     with progress_bar(Console(stderr=True)) as progress:

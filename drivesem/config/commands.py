@@ -836,8 +836,16 @@ class ClassifyConfig(FrameCommandConfig):
     """Training epochs."""
     batch: Count = 32
     """Pictures per training step."""
+    optimiser: Literal["adam", "sgd"] = "adam"
+    """Optimiser of training: adam with a cosine schedule, or sgd (momentum 0.9) at one rate, as in the paper's code."""
     rate: Annotated[float, POSITIVE] | None = None
-    """Learning rate of Adam (default: 0.003 for the last layer, 0.0001 for all)."""
+    """Learning rate (default: 0.003 for the last layer, 0.0001 for all)."""
+    normalisation: Literal["network", "rendered"] = "network"
+    """Normalisation of pictures for train, which the weights file keeps: the network's, or the mean and deviation of
+    the rendered set in the paper's code."""
+    lamp: Literal["white", "coloured"] = "white"
+    """Lamp: white and near the camera, or as in the paper's code: coloured, 100 object sizes before the object; attacks
+    move its R, G and B apart."""
     half: Annotated[NotNegative, OnlyWith("what", ("train",))] = 0
     """Epochs, from the first, with pictures of half the size, for --layers all."""
     precision: Annotated[Literal["float32", "bfloat16"], OnlyWith("what", ("train",))] = "float32"
@@ -846,12 +854,23 @@ class ClassifyConfig(FrameCommandConfig):
     """Parameters to attack, with commas: vertex, pose, lighting (default: pose,vertex; pose without gradients)."""
     shape: Literal["each", "smooth"] = "each"
     """Motion of vertices: each by itself as in the paper, or with a 4x4x4 lattice around the object."""
+    turns: Literal["add", "compose"] = "add"
+    """Turns of several steps: add pitch, yaw and roll, or compose, each about the mean of the vertices as they stand,
+    as in the paper's code."""
+    vertex_groups: Literal["object", "part"] = "object"
+    """Gradients of vertices in sgd and scw are normalised over the object, or over each mesh part (material), as in the
+    paper's code; a part without a finite gradient stays."""
+    attack_misclassified: Flag = False
+    """Also attack pictures that are misclassified unchanged, and let the last iterate count, as in the paper's code."""
     method: Literal["si-fgsm", "sgd", "scw", "random", "halton"] = "si-fgsm"
     """Search method: si-fgsm, sgd, scw use gradients as in the paper; random, halton sample --within-*."""
     steps: Count = 5
     """Gradient steps; an attack ends at its first success."""
     queries: Annotated[Count, OnlyWith("method", ("random", "halton"))] = 5
     """Samples per picture of random and halton."""
+    sampled: Literal["pose", "vertex,turn"] = "pose"
+    """What random and halton sample: --params, by default the pose; or vertices within 0.005 and one number within 0.3
+    for pitch, yaw and roll, as in the paper's code."""
     step_vertex: Annotated[float, POSITIVE] | None = None
     """Step of a vertex, in object sizes (default: the paper's for VGG-16, as for all steps)."""
     step_pose: Annotated[float, POSITIVE] | None = None
@@ -868,6 +887,10 @@ class ClassifyConfig(FrameCommandConfig):
     """Weight of a logit relative to the size of the change in scw."""
     norm: Annotated[Literal[1, 2], OnlyWith("method", ("scw",))] = 2
     """Norm of the change that scw keeps small."""
+    scw_step: Literal["adam", "unit"] = "adam"
+    """Steps of scw: Adam's, or the gradient over its 2-norm, with squared distances, as in the paper's code."""
+    target: Annotated[str, OnlyWith("method", ("scw",))] | None = None
+    """Class that scw makes the network predict (default: any wrong one)."""
     draws: Annotated[int, at_least(MIN_DRAWS, "which a certificate's rule needs")] = MIN_DRAWS
     """Nuisance samples before and after the change, for each certificate."""
     grade: bool = True
@@ -887,6 +910,18 @@ class ClassifyConfig(FrameCommandConfig):
             changed = getattr(self, name) != getattr(ClassifyConfig, name) and self.layers == "last"
             refuse(changed, f"--{name}", "--layers all", last)
         refuse(self.half > self.epochs, "--half", f"at most --epochs, {self.epochs}", self.half)
+        trained = self.what == "train" and self.normalisation == "rendered"
+        other = "vgg16, resnet50 or another that takes mean and deviation with --normalisation rendered"
+        refuse(trained and self.network == _DEFAULT_NETWORK, "--network", other, self.network)
+        scw, adam = self.method == "scw", self.scw_step == "adam"
+        refuse(self.norm != 2 and not adam, "--norm", f"2 with --scw-step {self.scw_step}", self.norm)
+        composed = scw and adam and self.turns == "compose"
+        refuse(composed, "--turns", "add with --method scw --scw-step adam", self.turns)
+        divided = self.vertex_groups == "part" and self.shape == "smooth"
+        refuse(divided, "--vertex-groups", "object with --shape smooth", self.vertex_groups)
+        sampled = self.method in ("random", "halton") and self.sampled == "vertex,turn" and self.params is not None
+        both = {"vertex", "pose"} <= {part.strip() for part in (self.params or "").split(",")}
+        refuse(sampled and not both, "--params", f"vertex and pose with --sampled {self.sampled}", self.params)
         of_run = self.what in _CLASSIFY_RUN
         run = f"a folder of drivesem classify attack, to {self.what}"
         refuse(of_run and not self.folder, "RUN", run, "nothing")

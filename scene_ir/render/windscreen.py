@@ -18,25 +18,27 @@ def add_drops(image: Tensor, amount: Tensor) -> Tensor:
     Where they are depends on the picture's size alone. Differentiable to both.
     """
     _, height, width = image.shape
-    pixel, looks_at, opacity, rank = (t.to(image.device) for t in _place_drops(height, width))
+    pixel, place_xy, opacity, rank = (t.to(image.device) for t in _place_drops(height, width))
     step = max(1, round(height / model.DROP_ROWS))
     small = interpolate(image[None], size=(height // step, width // step), mode="area")
-    shown = grid_sample(small, looks_at.to(image)[None, None], padding_mode="border", align_corners=False)[0, :, 0]
+    refracted = grid_sample(small, place_xy.to(image)[None, None], padding_mode="border", align_corners=False)[
+        0, :, 0
+    ]
     grown = ((1.0 + model.DROP_GROWS) * amount - rank.to(image)) / model.DROP_GROWS
     share = opacity.to(image) * grown.clamp(0.0, 1.0)
     flat = image.flatten(1)
-    return flat.index_add(1, pixel, share * (shown - flat[:, pixel])).reshape(image.shape)
+    return flat.index_add(1, pixel, share * (refracted - flat[:, pixel])).reshape(image.shape)
 
 
 @lru_cache(maxsize=8)
 def _place_drops(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Drops in a picture of a size, by the K pixels that they cover: index (K,) int64 of the pixel; where it looks at
-    (K, 2), as `grid_sample` counts; opacity (K,) in [0, 1]; rank (K,) in [0, 1] of its drop, the order in which they
+    """Drops in a picture of a size, by the K pixels that they cover: index (K,) int64 of the pixel; the place seen
+    through it (K, 2), as `grid_sample` counts; opacity (K,) in [0, 1]; rank (K,) in [0, 1] of its drop, the order in which they
     appear.
     """
     rng = np.random.default_rng(19031103)
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
-    opacity, rank, looks_at = np.zeros((height, width)), np.zeros((height, width)), np.zeros((height, width, 2))
+    opacity, rank, place_xy = np.zeros((height, width)), np.zeros((height, width)), np.zeros((height, width, 2))
     low, high = np.log(model.DROP_RADII)
     for order in np.linspace(0.0, 1.0, model.DROPS):
         x, y, aspect = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0.8, 1.2)
@@ -56,7 +58,7 @@ def _place_drops(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tenso
         places = np.stack([(x - bend * across + 0.5) / width, (y - bend * down + 0.5) / height], axis=-1)
         opacity[area] = np.where(newer, inside, opacity[area])
         rank[area] = np.where(newer, order, rank[area])
-        looks_at[area] = np.where(newer[..., None], 2.0 * places - 1.0, looks_at[area])
+        place_xy[area] = np.where(newer[..., None], 2.0 * places - 1.0, place_xy[area])
     pixel = np.flatnonzero(opacity)
-    planes = (looks_at.reshape(-1, 2)[pixel], opacity.reshape(-1)[pixel], rank.reshape(-1)[pixel])
+    planes = (place_xy.reshape(-1, 2)[pixel], opacity.reshape(-1)[pixel], rank.reshape(-1)[pixel])
     return torch.from_numpy(pixel), *(torch.from_numpy(plane) for plane in planes)

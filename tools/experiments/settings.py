@@ -124,14 +124,19 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
     """classification: networks to attack, with commas: squeezenet, or weights of drivesem classify train."""
     objects: str | None = None
     """classification: source of objects, as in drivesem classify; --limit counts their pictures (default: 480, with
-    --quick 36), --fresh those on which retrained networks are attacked (default: 232, with --quick 36)."""
+    --quick 12), --fresh those on which retrained networks are attacked (default: 232, with --quick 3)."""
     backgrounds: Annotated[str, ExistingFolder("a folder of photographs")] | None = None
     """classification: folder of photographs as backgrounds (default: generated pictures)."""
     train_pictures: Count | None = None
-    """classification: training pictures, of which half become counterexamples (default: 960, with --quick 144)."""
+    """classification: training pictures, of which half become counterexamples (default: 960, with --quick 12)."""
+    whole_pictures: Count | None = None
+    """classification: training pictures for whole networks, as the code trains them (default: 240, with --quick 12)."""
+    readings: str = "text,code"
+    """classification: readings of the paper, with commas: text, code (configs/paper-text.yaml, paper-code.yaml)."""
     tables: str | None = None
     """classification: tables to compute, with commas: degradation, parameters, hyperparameters, retraining,
-    robustness, worth, realism, transfer, pixels, sizes (default: all)."""
+    robustness, worth, realism, transfer, attribution, pixels, sizes (default: all; with --quick not parameters,
+    hyperparameters, pixels)."""
 
     def check(self) -> None:
         super().check()

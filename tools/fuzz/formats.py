@@ -414,7 +414,7 @@ def _classification_study(root: Path) -> None:
     facts = StudyFacts(
         settings=StudyConfig(name="classification", quick=True),
         classes=("box", "ball"),
-        networks=(StudyNetwork("one", "vgg16", in_slow_tables=True),),
+        networks=(StudyNetwork("one", "vgg16"),),
         tables=("pixels", "sizes"),
         measures=("psnr",),
         distance="perceptual",

@@ -136,6 +136,8 @@ class Problem:
     """(D,), upper bounds."""
     groups: tuple[ParameterGroup, ...] = (ParameterGroup("theta", slice(None)),)
     """The blocks of theta, which cover it."""
+    advance: Callable[[Tensor, Tensor], Tensor] = torch.add
+    """theta (D,) after a move (D,) from a theta; gradients are those of the loss in the move, at 0."""
     preview: Callable[[Tensor], Score | None] = _no_preview
     """Free estimate of `score` from the gradient pass at theta; None without such a pass."""
     keep_last: bool = False

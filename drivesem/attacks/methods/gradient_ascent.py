@@ -62,7 +62,7 @@ class GradientAscent(Attack):
             losses.append(loss)
             if self.momentum:
                 gradient = velocity = self.momentum * velocity + self._momentum_term(problem, gradient)
-            projected = problem.project(theta + self.rate * self._move(problem, gradient))
+            projected = problem.project(problem.advance(theta, self.rate * self._move(problem, gradient)))
             theta = projected.theta
             thetas.append(theta)
             active.extend(projected.active)

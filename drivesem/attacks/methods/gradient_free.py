@@ -43,6 +43,10 @@ def _score_nearest(problem: Problem, theta: Tensor, log: QueryLog) -> float:
     return score.loss
 
 
+_HALTON_LIMIT, _HALTON_BLOCK = 2048, 256
+"""Maximum dimension of one Halton sequence, and of each of several beyond it: large bases need gigabytes."""
+
+
 @dataclass(frozen=True, slots=True)
 class Sampling(QuerySearch):
     """Random samples, independent of earlier scores."""
@@ -68,7 +72,10 @@ class Sampling(QuerySearch):
         from scipy.stats import qmc  # imported on use: it takes a third of a second to load
 
         rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
-        return torch.from_numpy(qmc.Halton(dimensions, scramble=True, rng=rng).random(self.queries))
+        block = dimensions if dimensions <= _HALTON_LIMIT else _HALTON_BLOCK
+        sizes = [min(block, dimensions - first) for first in range(0, dimensions, block)]
+        blocks = [qmc.Halton(size, scramble=True, rng=rng).random(self.queries) for size in sizes]
+        return torch.from_numpy(np.concatenate(blocks, axis=1))
 
 
 _SIGMA = 0.25

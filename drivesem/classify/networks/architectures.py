@@ -20,6 +20,8 @@ from scene_ir.errors import FormatError
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Normalisation of RGB in [0, 1] with which torchvision's weights were trained."""
+RENDERED_MEAN, RENDERED_STD = (0.6109, 0.7387, 0.7765), (0.2715, 0.3066, 0.3395)
+"""Mean and deviation of the rendered pictures in the paper's code."""
 
 
 class ImageClassifier(Protocol):
@@ -66,6 +68,11 @@ class Classifier(nn.Module, ABC):
         self.classes = tuple(classes)
         self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(std).view(3, 1, 1), persistent=False)
+
+    def normalise_by(self, mean: Sequence[float], std: Sequence[float]) -> None:
+        """Set the mean and the deviation of RGB."""
+        self.mean.copy_(torch.tensor(mean).view(3, 1, 1))
+        self.std.copy_(torch.tensor(std).view(3, 1, 1))
 
     @abstractmethod
     def encode(self, normalised: Tensor) -> Tensor:

@@ -39,6 +39,8 @@ ARCHITECTURES: dict[str, type[Classifier]] = {
 """Networks by the name in weights files."""
 SHIPPED = DETECTORS[SqueezeDet.name].parent / "squeezenet-objects.safetensors"
 """Weights of `squeezenet`, for the embedded objects."""
+_NORMALISATION = "normalisation"
+"""Key of mean and deviation in weights files."""
 _TORCH_FILES = (".pth", ".pt", ".bin")
 
 
@@ -83,6 +85,12 @@ def load_classifier(name_or_path: str, classes: Sequence[str], device: str = "cp
         expected = f"one for the {len(classes)} classes {', '.join(classes)}"
         raise FormatError(str(path), expected, f"one for {', '.join(network.classes)}")
     load_weights(network, tensors, path)
+    if _NORMALISATION in metadata:
+        try:
+            network.normalise_by(*json.loads(metadata[_NORMALISATION]))
+        except (ValueError, TypeError, RuntimeError) as error:
+            found = repr(metadata[_NORMALISATION])[:60]
+            raise FormatError(f"{path}: {_NORMALISATION}", "mean and deviation of RGB", found) from error
     return prepare_for_inference(network, device)
 
 
@@ -137,6 +145,7 @@ def save_classifier(network: Classifier, path: Path, facts: Mapping[str, str]) -
     """
     tensors = {key: value for key, value in half_precision_state(network).items() if value.is_floating_point()}
     metadata = {"architecture": network.architecture, "classes": json.dumps(list(network.classes)), **facts}
+    metadata[_NORMALISATION] = json.dumps([network.mean.flatten().tolist(), network.std.flatten().tolist()])
     write_weights(path, metadata, tensors)
 
 

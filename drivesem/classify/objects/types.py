@@ -59,6 +59,13 @@ class ObjectModel:
                 expected = "at least 0" if most == float("inf") else "values in [0, 1]"
                 raise RangeError(f"{self.name}: {field}", expected, low if low < 0 else high)
 
+    def vertex_parts(self) -> Tensor:
+        """Mesh part of each vertex (V,) int64: the first of its faces' materials, as meshes are divided in files."""
+        kinds = torch.cat([self.diffuse, self.specular[:, None], self.shininess[:, None]], dim=1)
+        part = torch.unique(kinds, dim=0, return_inverse=True)[1]
+        faces, parts = self.mesh.faces, part.new_full((len(self.mesh.vertices),), len(kinds))
+        return parts.scatter_reduce(0, faces.reshape(-1), part.repeat_interleave(3), "amin")
+
 
 def drop_unused_vertices(mesh: Mesh) -> Mesh:
     """Drop vertices without faces, which are invisible but would be attacked."""

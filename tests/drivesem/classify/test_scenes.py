@@ -15,9 +15,8 @@ from drivesem.classify.scenes import (
     generate_background,
     open_backgrounds,
     picture_camera,
-    rotation_matrix,
 )
-from drivesem.classify.space import ObjectChange, ObjectSpace, ParameterAmounts, parse_parameters
+from drivesem.classify.space import ObjectChange, ObjectSpace, ParameterAmounts, parse_parameters, rotation_matrix
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.render.lit_mesh import composite_over

@@ -60,9 +60,60 @@ class ClassificationArm:
         """Its folder."""
         return Path(self.config.out or "")
 
+    @property
+    def pending(self) -> int:
+        """Number of its pictures without a result."""
+        return sum(not self.is_done(one) for one in self.views)
+
+    def is_done(self, view: ObjectView) -> bool:
+        """Whether a picture has a result."""
+        return (self.out / FRAMES / view.identifier / RESULT).is_file()
+
     def frames(self, views: Sequence[ObjectView]) -> list[ClassifiedPicture]:
         """Results of some of its pictures."""
         return load_picture_results(self.out, views)
+
+
+READINGS = ("text", "code")
+"""Readings of the paper."""
+CONTROL = "control"
+"""The last layer trained on the pictures of the differences in training, without a difference."""
+_TRAINING = ("layers", "optimiser", "batch", "rate", "epochs")
+DIFFERENCES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "training": (_TRAINING, GRADIENT_STRATEGIES),
+    "scw-step": (("scw_step",), ("scw",)),
+    "vertex-groups": (("vertex_groups",), ("sgd",)),
+    "turns": (("turns",), ("si-fgsm", "sgd")),
+    "attack-misclassified": (("attack_misclassified",), GRADIENT_STRATEGIES),
+    "normalisation": (("normalisation",), GRADIENT_STRATEGIES),
+    "lamp": (("lamp",), GRADIENT_STRATEGIES),
+    "sampled": (("sampled",), ("random-small", "halton-small")),
+}
+"""Differences between the paper's code and its text: the settings, and the strategies that they change."""
+TRAINED = ("training", "normalisation", "lamp")
+"""Differences for which a network is trained."""
+
+
+def attributed_strategies(difference: str, quick: bool) -> tuple[str, ...]:
+    """Strategies with which a difference, or CONTROL, is measured: all that it changes, or with --quick the first."""
+    strategies = GRADIENT_STRATEGIES if difference == CONTROL else DIFFERENCES[difference][1]
+    return strategies[:1] if quick else strategies
+
+
+@cache
+def code_settings(difference: str = "") -> Mapping[str, Any]:
+    """Settings of the paper's code, or of one difference from its text."""
+    settings = files.read_yaml(find_presets()["paper-code"])
+    names = DIFFERENCES[difference][0] if difference else settings.keys() - {"for"}
+    return {name: settings[name] for name in names}
+
+
+def attack_settings(network: str, strategy: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of an attack: the paper's for one of its networks, and further ones, without those of training."""
+    further = {name: value for name, value in settings.items() if name not in (*_TRAINING, "normalisation")}
+    if strategy in _SAMPLES and "sampled" in further:
+        further["params"] = "pose,vertex"
+    return {**paper_preset(network, strategy), **further}
 
 
 @cache
@@ -123,12 +174,7 @@ def run_classification_arms(arms: Sequence[ClassificationArm], study: StudyConfi
     """
     for arm in arms:
         claim_folder(arm.out, arm.config, WRITTEN)
-    jobs = [
-        (i, one)
-        for i, arm in enumerate(arms)
-        for one in arm.views
-        if not (arm.out / FRAMES / one.identifier / RESULT).is_file()
-    ]
+    jobs = [(i, one) for i, arm in enumerate(arms) for one in arm.views if not arm.is_done(one)]
     build = partial(_ArmAttackers, tuple(arms))
     return run_frame_jobs(
         jobs, build(), build, study, ProgressSettings(title, show_remaining=True), lambda job: job[1].identifier

@@ -6,6 +6,7 @@ import copy
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from drivesem.classify.networks.architectures import Classifier
+from drivesem.classify.networks.architectures import Classifier, SqueezeNet
+from drivesem.classify.networks.loading import load_classifier
+from drivesem.classify.pictures import read_images
 from drivesem.classify.training import compute_features
 from drivesem.reporting.tables import Console, training_progress_bar
 from drivesem.run.detection_cache import weights_digest
@@ -57,25 +60,44 @@ class NetworkFeatures:
     """Name in files and tables."""
     spec: str
     """Name or file to load it from."""
-    network: Classifier
-    """The network."""
+    classes: tuple[str, ...]
+    """Names of its classes."""
     folder: Path
     """Folder of the study."""
     device: str
     """torch device."""
+    text: NetworkFeatures | None = None
+    """The network from which this one is trained as the paper's code does; None if this is one of the text."""
+
+    @cached_property
+    def network(self) -> Classifier:
+        """The network. Raises FormatError if it cannot be loaded."""
+        return load_classifier(self.spec, self.classes, self.device)
+
+    @property
+    def reading(self) -> str:
+        """Reading of the paper."""
+        return "text" if self.text is None else "code"
 
     @property
     def paper_network(self) -> str:
         """The paper's network that it is compared with: VGG-16, unless it is a ResNet-50."""
-        return "resnet50" if self.network.architecture.startswith("resnet") else "vgg16"
+        network = self.network if self.text is None else self.text.network
+        return "resnet50" if network.architecture.startswith("resnet") else "vgg16"
+
+    @property
+    def takes_normalisation(self) -> bool:
+        """Whether it can be trained with another mean and deviation; SqueezeNet's weights take 0 to 255."""
+        network = self.network if self.text is None else self.text.network
+        return network.architecture != SqueezeNet.architecture
 
     def features(self, name: str, paths: Sequence[Path]) -> Tensor:
         """Features (N, K) of a set of pictures called `name`."""
 
         def compute() -> Mapping[str, np.ndarray]:
-            images = torch.from_numpy(np.stack([files.read_image(path) for path in paths])).permute(0, 3, 1, 2)
             title = f"features of {self.name}, {name}"
-            return {"features": compute_features(self.network, images, self.device, title).cpu().numpy()}
+            features = compute_features(self.network, read_images(paths), self.device, title)
+            return {"features": features.cpu().numpy()}
 
         path = self.folder / FEATURES / f"{self.name}-{name}.npz"
         return torch.from_numpy(load_or_compute(path, self.cache_key(paths), compute)["features"]).to(self.device)

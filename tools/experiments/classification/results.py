@@ -120,8 +120,10 @@ class StudyNetwork:
     """Name in files and tables."""
     paper_network: str
     """The paper's network that it is compared with."""
-    in_slow_tables: bool
-    """Whether it is in the tables that take long."""
+    reading: str = "text"
+    """Reading of the paper."""
+    takes_normalisation: bool = True
+    """Whether the rendered set's normalisation applies to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,11 +202,6 @@ class ClassificationResults:
         default_factory=dict[tuple[str, str], "int | None"]
     )
     """Certain failures by network and strategy."""
-
-    @property
-    def slow_networks(self) -> tuple[StudyNetwork, ...]:
-        """Networks of the tables that take long."""
-        return tuple(one for one in self.facts.networks if one.in_slow_tables)
 
     @cached_property
     def bootstrap(self) -> RatioBootstrap:

@@ -15,29 +15,37 @@ import torch
 from torch import Tensor
 
 from drivesem.analysis.transfer import split_list
-from drivesem.classify.networks.architectures import Classifier
+from drivesem.attacks.methods.base import GRADIENT_PASSES
+from drivesem.classify.networks.architectures import RENDERED_MEAN, RENDERED_STD, Classifier
 from drivesem.classify.networks.loading import load_classifier, prepare_for_inference, save_classifier
 from drivesem.classify.objects.embedded import open_objects
 from drivesem.classify.objects.types import SPLITS, ObjectSet, Split
-from drivesem.classify.pictures import ObjectRenderer, ObjectView, picture_path, render_pictures
+from drivesem.classify.pictures import ObjectRenderer, ObjectView, picture_path, read_images, render_pictures
 from drivesem.classify.results import write_run_report
 from drivesem.classify.scenes import VIEWS, open_backgrounds
-from drivesem.classify.training import compute_features, train_last_layer
+from drivesem.classify.space import Lamp
+from drivesem.classify.training import compute_features, train_all_layers, train_last_layer
 from drivesem.config.commands import ClassifyConfig
 from drivesem.config.errors import UsageError
-from drivesem.reporting.tables import AnalysisReport
+from drivesem.reporting.tables import AnalysisReport, Console
 from drivesem.run.folder import ARMS, FRAMES, PRESENTATION, RETRAINED, claim_folder, resolve_output_folder
 from scene_ir import files
 from tools.experiments.classification.arms import (
     BENIGN,
     BENIGN_RETRAINED,
+    CONTROL,
+    DIFFERENCES,
     GRADIENT_STRATEGIES,
+    READINGS,
     RETRAINED_TABLES,
     SINGLE_PARAMS,
     STRATEGIES,
+    TRAINED,
     ClassificationArm,
     arm_config,
-    paper_preset,
+    attack_settings,
+    attributed_strategies,
+    code_settings,
     run_classification_arms,
 )
 from tools.experiments.classification.features import (
@@ -69,6 +77,8 @@ from tools.experiments.worth.points import PREFERRED_DISTANCES
 PICTURES = "pictures"
 """Folder of the pictures to train on."""
 EPOCHS = 20
+_MOST_PASSES = 1 + 5 * (GRADIENT_PASSES + 1)
+"""Passes of the network in an attack of five steps that does not stop early."""
 _TABLE_STRATEGIES = {
     "degradation": STRATEGIES,
     "worth": STRATEGIES,
@@ -76,11 +86,14 @@ _TABLE_STRATEGIES = {
     **dict.fromkeys(
         ("parameters", "hyperparameters", "retraining", "robustness", "transfer"), GRADIENT_STRATEGIES
     ),
+    "attribution": (*GRADIENT_STRATEGIES, *DIFFERENCES["sampled"][1]),
     "pixels": GRADIENT_STRATEGIES[:1],
     "sizes": (),
 }
 TABLES = tuple(_TABLE_STRATEGIES)
-_SIZES = {"limit": (480, 36), "fresh": (232, 36), "train_pictures": (960, 144)}
+_LONG_TABLES = ("parameters", "hyperparameters", "pixels")
+"""Tables that --quick leaves out by default."""
+_SIZES = {"limit": (480, 12), "fresh": (232, 3), "train_pictures": (960, 12), "whole_pictures": (240, 12)}
 """Number of pictures by default and with --quick."""
 
 
@@ -88,15 +101,17 @@ _WRITTEN = (
     *("study.md", "study.json", *(f"{name}.csv" for name in (*TABLES, ORDERS))),
     *(ARMS, RESULTS, FEATURES, RETRAINED, PICTURES),
 )
-_FREE_SETTINGS = (*PRESENTATION, "bootstrap", "tables", "networks", "fresh")
+_FREE_SETTINGS = (*PRESENTATION, "bootstrap", "tables", "readings", "networks", "fresh")
 """Settings that may differ when a study is continued: they add attacks, and change none."""
 _TEXT_COLUMNS = (
     *("network", "strategy", "trained on", "parameters", "settings", "made against", "tested on", "class"),
     *("membership", "realism weight", "metric", "table", "first", "second", "the paper's order"),
+    "difference",
 )
 _NOTE = (
     "Overall: mean over classes weighted by their sizes, which is the share of all pictures; in brackets 95 % of "
-    "{draws} bootstrap draws of objects. A picture that is misclassified unchanged counts as wrong before and after. "
+    "{draws} bootstrap draws of objects. A picture that is misclassified unchanged counts as wrong before and after, "
+    "except with networks named -code, which are trained and attacked by configs/paper-code.yaml. "
     "The paper's numbers are for ShapeNet's objects, photographs and another renderer: a comparison, not a target."
 )
 
@@ -131,14 +146,20 @@ class ClassificationStudy:
     @classmethod
     def from_config(cls, study: StudyConfig) -> ClassificationStudy:
         """Load objects and networks. Raises UsageError or SceneError for what cannot be used."""
-        tables = tuple(split_list(study.tables)) if study.tables is not None else TABLES
+        usual = tuple(name for name in TABLES if not (study.quick and name in _LONG_TABLES))
+        tables = tuple(split_list(study.tables)) if study.tables is not None else usual
+        readings = split_list(study.readings)
+        if not readings or not set(readings) <= set(READINGS):
+            raise UsageError("--readings", f"names among {', '.join(READINGS)}", repr(study.readings))
         if not tables or not set(tables) <= set(TABLES):
             raise UsageError("--tables", f"names among {', '.join(TABLES)}", repr(study.tables))
         sizes = {name: getattr(study, name) or pair[study.quick] for name, pair in _SIZES.items()}
         out = resolve_output_folder(study.out, Path("runs") / f"study-classification-seed{study.seed}")
         objects = open_objects(study.objects)
         open_backgrounds(study.backgrounds)
-        networks = _load_networks(study, objects.classes, out)
+        text = _load_networks(study, objects.classes, out)
+        code = [_code_network(one) for one in text] if "code" in readings else []
+        networks = (*(text if "text" in readings else ()), *code)
         test = _sample_views(objects, "test", sizes["limit"], study.seed)
         train = _sample_views(objects, "train", sizes["train_pictures"], study.seed)
         return cls(replace(study, **sizes), out, objects, networks, tables, test, train)
@@ -147,11 +168,6 @@ class ClassificationStudy:
     def classes(self) -> tuple[str, ...]:
         """Classes of objects."""
         return self.objects.classes
-
-    @property
-    def slow_networks(self) -> tuple[NetworkFeatures, ...]:
-        """Networks of the tables that take long: with --quick the first alone."""
-        return self.networks[:1] if self.study.quick else self.networks
 
     def wants(self, *names: str) -> bool:
         """Whether any of these tables is to be made."""
@@ -189,19 +205,26 @@ class ClassificationStudy:
         """Attack the original networks. Raises UsageError or SceneError."""
         strategies = [one for one in STRATEGIES if any(one in _TABLE_STRATEGIES[name] for name in self.tables)]
         for network, strategy in product(self.networks, strategies):
-            settings, grade = paper_preset(network.paper_network, strategy), not self.study.quick
+            settings, grade = self._settings(network, strategy), not self.study.quick
             self._add("test", network, strategy, self.test, strategy, **settings, grade=grade)
-        for network, strategy in product(self.slow_networks, GRADIENT_STRATEGIES):
-            settings = paper_preset(network.paper_network, strategy)
+        for network, strategy in product(self.networks, GRADIENT_STRATEGIES):
+            settings = self._settings(network, strategy)
             for params in SINGLE_PARAMS if self.wants("parameters") else ():
                 name = f"{strategy}-{params.replace(',', '-')}"
                 self._add(params, network, strategy, self.test, name, **{**settings, "params": params})
             for paper_network in {*NETWORKS} - {network.paper_network} if self.wants("hyperparameters") else ():
-                name, preset = f"{strategy}-as-{paper_network}", paper_preset(paper_network, strategy)
+                name, preset = f"{strategy}-as-{paper_network}", self._settings(network, strategy, paper_network)
                 self._add(paper_network, network, strategy, self.test, name, **preset)
             if self.wants(*RETRAINED_TABLES):
                 views = [self.train[place] for place in self.replaced]
                 self._add("train", network, strategy, views, f"{strategy}-train", **settings)
+        variants = {one: {"code"} for one in self.networks if one.text is not None}
+        if self.wants("attribution"):
+            variants |= {one: self._add_differences(one) for one in self.networks if one.text is None}
+        self._announce_hours(variants)
+        for network, names in variants.items():
+            for name in sorted(names):
+                self._train_variant(network.text or network, name, Path(self._variant_path(network, name)))
         self.failed |= run_classification_arms(list(self.arms.values()), self.study, "attacking pictures")
         if not self.usable:
             raise UsageError(
@@ -211,6 +234,88 @@ class ClassificationStudy:
             if key[0] == "test":
                 seconds = sum(frame.seconds for frame in arm.frames(self.usable))
                 write_run_report(arm.config, arm.out, self.classes, self.usable, {}, seconds)
+
+    def _settings(self, network: NetworkFeatures, strategy: str, paper_network: str = "") -> dict[str, Any]:
+        """Settings of an attack on a network, under its reading and with the steps for one of the paper's networks."""
+        reading = code_settings() if network.reading == "code" else {}
+        return attack_settings(paper_network or network.paper_network, strategy, reading)
+
+    def _add_differences(self, network: NetworkFeatures) -> set[str]:
+        """Add the arms of the table of attribution, and return the names of the networks to train for them."""
+        names = [one for one in DIFFERENCES if one != "normalisation" or network.takes_normalisation]
+        for difference in (*names, CONTROL):
+            settings = {} if difference == CONTROL else code_settings(difference)
+            trained = difference in (*TRAINED, CONTROL)
+            spec = self._variant_path(network, difference) if trained else network.spec
+            for strategy in attributed_strategies(difference, self.study.quick):
+                attack = attack_settings(network.paper_network, strategy, settings)
+                name = f"{strategy}-with-{difference}"
+                self._add(f"with {difference}", network, strategy, self.test, name, **attack, network=spec)
+        return {CONTROL, *names} & {CONTROL, *TRAINED}
+
+    def _variant_path(self, network: NetworkFeatures, name: str) -> str:
+        return network.spec if name == "code" else str(self._weights(network, f"with-{name}"))
+
+    @cached_property
+    def whole(self) -> tuple[ObjectView, ...]:
+        """Training pictures for whole networks; classes keep their shares."""
+        rng = np.random.default_rng(self.study.seed)
+        size = self.study.whole_pictures or len(self.train)
+        return tuple(self.train[place] for place in sample_stratified(self.labels(self.train), size, rng))
+
+    def _render(self, views: Sequence[ObjectView], lamp: Lamp) -> list[Path]:
+        """Paths of training pictures under a lamp, which are rendered where they are missing."""
+        config = replace(arm_config(self.study, self.out, "", ""), lamp=lamp)
+        folder = self.out / PICTURES / lamp
+        self.failed |= render_pictures(views, ObjectRenderer.from_config(config), config, folder).failed
+        return [picture_path(one, folder) for one in views if one.identifier not in self.failed]
+
+    def _train_variant(self, network: NetworkFeatures, name: str, path: Path) -> None:
+        """Train a network further with one difference of the paper's code, all of them (`code`) or none (CONTROL)."""
+        if path.is_file():
+            return
+        known = {CONTROL: {}, "code": code_settings()}
+        settings = dict(known[name] if name in known else code_settings(name))
+        lamp: Lamp = settings.pop("lamp", "white")
+        paths = self._render(self.whole, lamp)
+        usable = [one for one in self.whole if one.identifier not in self.failed]
+        labels = torch.tensor(self.labels(usable), device=self.study.device)
+        learner = copy.deepcopy(network.network).requires_grad_(True)
+        if settings.get("normalisation") == "rendered" and network.takes_normalisation:
+            learner.normalise_by(RENDERED_MEAN, RENDERED_STD)
+        options = {one: settings[one] for one in DIFFERENCES["training"][0] if one in settings}
+        config = ClassifyConfig(what="train", device=self.study.device, **{"epochs": EPOCHS, **options})
+        images, generator = read_images(paths), torch.Generator().manual_seed(self.study.seed)
+        torch.manual_seed(self.study.seed)  # dropout draws from torch's own
+        truth = {"train": labels, "val": labels[:1]}
+        if config.layers == "all":
+            pictures, checkpoint = {"train": images, "val": images[:1]}, path.with_suffix(".checkpoint")
+            train_all_layers(learner, pictures, truth, config, generator, checkpoint)
+            checkpoint.unlink()
+        else:
+            learner.eval()
+            features = compute_features(learner, images, self.study.device, f"features of {network.name}, {name}")
+            known_features = {"train": features, "val": features[:1]}
+            train_last_layer(learner, known_features, truth, config, generator, continued=True)
+        save_classifier(prepare_for_inference(learner, self.study.device), path, {"trained_on": str(len(labels))})
+
+    def _announce_hours(self, variants: Mapping[NetworkFeatures, set[str]]) -> None:
+        """Attack two pictures on each network of the user, and print how long all others may take."""
+        hours, count = 0.0, 0
+        for base in dict.fromkeys(one.text or one for one in self.networks):
+            shape = self._settings(base, GRADIENT_STRATEGIES[0])
+            config = arm_config(self.study, self.out, f"{base.name}-timing", base.spec, **shape)
+            arm = ClassificationArm(config, self.test[:2])
+            if self.arms and not run_classification_arms([arm], self.study, f"timing {base.name}"):
+                frame = arm.frames(arm.views)[-1]  # the first one loads libraries
+                own = [one for one in self.networks if base in (one, one.text)]
+                jobs = sum(one.pending for key, one in self.arms.items() if key[1] in {x.name for x in own})
+                jobs += len(own) * 9 * (self.study.fresh or 0) if self.wants("robustness") else 0
+                whole = sum(len(names & {"code", "training"}) for net, names in variants.items() if net in own)
+                passes = jobs * _MOST_PASSES + whole * EPOCHS * len(self.whole) * GRADIENT_PASSES
+                hours, count = hours + passes * frame.seconds / frame.passes / 3600, count + jobs
+        text = f"{count} attacks are left, for at most {hours:.2g} hours of one process at its present speed"
+        Console(stderr=True).print(text, highlight=False)
 
     def _add(
         self,
@@ -230,15 +335,17 @@ class ClassificationStudy:
         """Retrain networks on each method's counterexamples, and attack them anew."""
         if not self.wants(*RETRAINED_TABLES):
             return
-        config = arm_config(self.study, self.out, "", self.networks[0].spec)
-        renderer = ObjectRenderer.from_config(config)
-        self.failed |= render_pictures(self.train, renderer, config, self.out / PICTURES).failed
+        lamps = {
+            one.name: self._settings(one, GRADIENT_STRATEGIES[0]).get("lamp", "white") for one in self.networks
+        }
+        for lamp in sorted(set(lamps.values())):
+            self._render(self.train, lamp)
         usable = [i for i, one in enumerate(self.train) if one.identifier not in self.failed]
         views = [self.train[i] for i in usable]
         labels = torch.tensor(self.labels(views))
-        paths = [picture_path(one, self.out / PICTURES) for one in views]
         replaced = torch.tensor([i in set(self.replaced) for i in usable])
-        for network in self.slow_networks:
+        for network in self.networks:
+            paths = [picture_path(one, self.out / PICTURES / lamps[network.name]) for one in views]
             benign = network.features("train", paths)
             self.retrained[network.name, BENIGN] = network.network
             for trained in (BENIGN_RETRAINED, *GRADIENT_STRATEGIES):
@@ -256,11 +363,8 @@ class ClassificationStudy:
 
     def _attack_retrained(self) -> None:
         before = set(self.arms)
-        for network, trained, strategy in product(self.slow_networks, GRADIENT_STRATEGIES, GRADIENT_STRATEGIES):
-            settings = {
-                **paper_preset(network.paper_network, strategy),
-                "network": str(self._weights(network, trained)),
-            }
+        for network, trained, strategy in product(self.networks, GRADIENT_STRATEGIES, GRADIENT_STRATEGIES):
+            settings = {**self._settings(network, strategy), "network": str(self._weights(network, trained))}
             name = f"{trained}-retrained-{strategy}"
             self._add(f"against {trained}", network, strategy, self.retested, name, **settings)
         fresh = [arm for key, arm in self.arms.items() if key not in before]
@@ -351,7 +455,6 @@ class ClassificationStudy:
 
     def facts(self, settings: StudyConfig) -> StudyFacts:
         """The facts of the study once its attacks and networks are done; settings: as they were typed."""
-        slow = [network.name for network in self.slow_networks]
 
         def count_by_class(names: list[str]) -> dict[str, int]:
             kinds = [name.partition("/")[0] for name in names]
@@ -360,14 +463,22 @@ class ClassificationStudy:
         return StudyFacts(
             settings=settings,
             classes=self.classes,
-            networks=tuple(StudyNetwork(one.name, one.paper_network, one.name in slow) for one in self.networks),
+            networks=tuple(
+                StudyNetwork(one.name, one.paper_network, one.reading, one.takes_normalisation)
+                for one in self.networks
+            ),
             tables=self.tables,
             measures=tuple(self.measures) if self.wants("realism") else (),
             distance=next(name for name in PREFERRED_DISTANCES if why_missing(name, None) is None),
             toolbox=has_pixel_attacks(),
             pictures=tuple(one.name for one in self.usable),
             retested=self.retested_places,
-            counts={"test": len(self.usable), "train": len(self.train), "retrained": len(self.retested)},
+            counts={
+                "test": len(self.usable),
+                "train": len(self.train),
+                "retrained": len(self.retested),
+                "whole": len(self.whole),
+            },
             objects={split: count_by_class(list(self.objects.names(split))) for split in SPLITS},
             used={
                 split: count_by_class([one.name for one in views])
@@ -396,9 +507,19 @@ def _load_networks(study: StudyConfig, classes: tuple[str, ...], out: Path) -> t
     names = [Path(spec).stem for spec in specs]
     if not specs or len(set(names)) < len(names):
         raise UsageError("--networks", "networks with commas, each of another name", repr(study.networks))
-    loaded = [load_classifier(spec, classes, study.device) for spec in specs]
-    networks = zip(names, specs, loaded, strict=True)
-    return tuple(NetworkFeatures(name, spec, network, out, study.device) for name, spec, network in networks)
+    networks = [
+        NetworkFeatures(name, spec, classes, out, study.device) for name, spec in zip(names, specs, strict=True)
+    ]
+    for network in networks:
+        network.network.eval()  # which loads it: a file that cannot be used is refused now
+    return tuple(networks)
+
+
+def _code_network(text: NetworkFeatures) -> NetworkFeatures:
+    """The network that is trained from a network as the paper's code does."""
+    name = f"{text.name}-code"
+    path = text.folder / RETRAINED / f"{name}.safetensors"
+    return NetworkFeatures(name, str(path), text.classes, text.folder, text.device, text)
 
 
 def draw_half(count: int, seed: int) -> list[int]:

@@ -16,11 +16,15 @@ from drivesem.reporting.tables import ReportTable
 from tools.experiments.classification.arms import (
     BENIGN,
     BENIGN_RETRAINED,
+    CONTROL,
+    DIFFERENCES,
     GRADIENT_STRATEGIES,
     RETRAINED_TABLES,
     SINGLE_PARAMS,
     STRATEGIES,
     STRATEGY_NAMES,
+    TRAINED,
+    attributed_strategies,
     paper_preset,
 )
 from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT
@@ -51,6 +55,8 @@ _HEADS = {
     "step_pose": "step pose",
     "within_vertex": "within vertex",
     "within_pose": "within pose",
+    "as_text": "text",
+    "as_code": "code",
 }
 _SETTINGS = ("step_vertex", "step_pose", "within_vertex", "within_pose", "steps")
 _PLAIN = ("pictures", "certain", "worth", "gain", "distance", *_SETTINGS)
@@ -177,7 +183,7 @@ def _parameters(results: ClassificationResults) -> ResultTable:
     rows: list[Row] = []
     orders: list[Row] = []
     moved = (*SINGLE_PARAMS[:3], _BOTH, SINGLE_PARAMS[3])
-    for network, strategy in product(results.slow_networks, GRADIENT_STRATEGIES):
+    for network, strategy in product(results.facts.networks, GRADIENT_STRATEGIES):
         ours = {
             one: results.predictions("attacked", network, strategy, "test" if one == _BOTH else one)
             for one in moved
@@ -203,7 +209,7 @@ def _hyperparameters(results: ClassificationResults) -> ResultTable:
     for paper_network, strategy in product(NETWORKS, GRADIENT_STRATEGIES):
         settings = {"strategy": strategy, "settings": NETWORKS[paper_network]}
         settings |= {key: paper_preset(paper_network, strategy).get(key) for key in _SETTINGS}
-        for network in results.slow_networks:
+        for network in results.facts.networks:
             arms = "test" if paper_network == network.paper_network else paper_network
             answers = results.predictions("attacked", network, strategy, arms)
             rows.append({"network": network.name, **settings, **_overall(results, answers)})
@@ -220,7 +226,7 @@ def _learners(
     """Networks that were trained so, on each of TESTS; `what` as in `ClassificationResults.predictions`."""
     rows: list[Row] = []
     orders: list[Row] = []
-    for network in results.slow_networks:
+    for network in results.facts.networks:
         for one in (BENIGN, *trained):
             row: Row = {"network": network.name, "trained_on": one}
             for test in TESTS:
@@ -251,10 +257,10 @@ def _robustness(results: ClassificationResults) -> ResultTable:
     return _learners(results, "robustness", title, GRADIENT_STRATEGIES, "fresh")
 
 
-def _is_retrained(results: ClassificationResults, network: StudyNetwork, strategy: str) -> bool:
+def _is_retrained(results: ClassificationResults, strategy: str) -> bool:
     """Whether the network was retrained on this attack's counterexamples."""
     made = any(name in results.facts.tables for name in RETRAINED_TABLES)
-    return network.in_slow_tables and strategy in GRADIENT_STRATEGIES and made
+    return strategy in GRADIENT_STRATEGIES and made
 
 
 def _worth(results: ClassificationResults) -> ResultTable:
@@ -269,7 +275,7 @@ def _worth(results: ClassificationResults) -> ResultTable:
             row: Row = {"network": network.name, "strategy": strategy, "membership": kind, "weighted": weighted}
             before = results.points(network, strategy, rho)
             row |= interval_columns("worth", worth_interval(before, setting), 5)
-            if _is_retrained(results, network, strategy):
+            if _is_retrained(results, strategy):
                 after = results.points(network, strategy, rho, trained=strategy)
                 row |= interval_columns("gain", information_gain(before, after, setting), 5)
             rows.append(row)
@@ -311,7 +317,8 @@ def _realism(results: ClassificationResults) -> ResultTable:
 def _transfer(results: ClassificationResults) -> ResultTable:
     rows = []
     for source, target in product(results.facts.networks, results.facts.networks):
-        for strategy in (BENIGN, *GRADIENT_STRATEGIES) if source is not target else ():
+        crossed = source is not target and source.reading == target.reading
+        for strategy in (BENIGN, *GRADIENT_STRATEGIES) if crossed else ():
             row = {"source": source.name, "target": target.name, "strategy": strategy}
             rows.append(
                 row | _with_classes(results, results.predictions("crossed", source, strategy, target.name))
@@ -330,7 +337,7 @@ def _transfer(results: ClassificationResults) -> ResultTable:
 
 def _pixels(results: ClassificationResults) -> ResultTable:
     rows: list[Row] = []
-    for network, attack in product(results.slow_networks if results.facts.toolbox else (), PIXEL_ATTACKS):
+    for network, attack in product(results.facts.networks if results.facts.toolbox else (), PIXEL_ATTACKS):
         row: Row = {"network": network.name, "strategy": attack}
         row |= _overall(results, results.predictions("pixels", network, attack, ""))
         rows.append(
@@ -340,6 +347,29 @@ def _pixels(results: ClassificationResults) -> ResultTable:
     notes = (note,) if rows else (f"Attacks on pixels need a library: {PIXELS_HINT}.",)
     columns = ("network", "strategy", "pictures", "overall", "distance")
     return ResultTable("pixels", "Accuracy after attacks on pixels, for comparison, %", columns, rows, (), notes)
+
+
+def _attribution(results: ClassificationResults) -> ResultTable:
+    rows = []
+    for network, difference in product(results.facts.networks, DIFFERENCES):
+        if network.reading != "text" or (difference == "normalisation" and not network.takes_normalisation):
+            continue
+        for strategy in attributed_strategies(difference, results.facts.settings.quick):
+            arms = (f"with {CONTROL}" if difference in TRAINED else "test", f"with {difference}")
+            before, after = (results.predictions("attacked", network, strategy, arm) for arm in arms)
+            row: Row = {"network": network.name, "difference": difference, "strategy": strategy}
+            row |= {"pictures": len(before.correct)}
+            for name, one in (("as_text", before), ("as_code", after)):
+                row[name] = _rounded(one.overall(results.bootstrap).value)
+            rows.append(row | interval_columns("effect", before.accuracy_drop(after, results.bootstrap), 5))
+    note = (
+        "Accuracy after the attack with one setting of the paper's code, and its paired difference from the text's. "
+        f"Networks for {', '.join(TRAINED)} are trained on {results.facts.counts.get('whole', 0)} pictures, and so is "
+        "the network without the difference: its last layer. Retrained networks of all tables have a new last layer."
+    )
+    columns = ("network", "difference", "strategy", "pictures", "as_text", "as_code", "effect")
+    title = "What each difference between the paper's text and code changes, points of accuracy"
+    return ResultTable("attribution", title, columns, rows, (), (note,))
 
 
 def _sizes(results: ClassificationResults) -> ResultTable:
@@ -386,6 +416,7 @@ _BUILDERS: dict[str, Callable[[ClassificationResults], ResultTable]] = {
     "retraining": _retraining,
     "robustness": _robustness,
     "transfer": _transfer,
+    "attribution": _attribution,
     "hyperparameters": _hyperparameters,
     "pixels": _pixels,
     "sizes": _sizes,

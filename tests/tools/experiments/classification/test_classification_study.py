@@ -15,7 +15,7 @@ from scene_ir import files
 from tests.drivesem.classify.conftest import KINDS, ColourClassifier, SolidObjects
 from tools.experiments.__main__ import main
 from tools.experiments.classification import study as study_module
-from tools.experiments.classification.arms import STRATEGIES
+from tools.experiments.classification.arms import DIFFERENCES, STRATEGIES
 from tools.experiments.classification.features import PIXEL_ATTACKS, PIXELS_HINT, attack_pixels, has_pixel_attacks
 from tools.experiments.classification.study import TABLES, classify_features, retrain_last_layer
 
@@ -71,7 +71,7 @@ def test_sizes_need_no_attack(two_networks, tmp_path, capsys):
         "train objects": 6,
         "val objects": 2,
         "test objects": 2,
-        "train pictures": 24,
+        "train pictures": 4,
         "test pictures": 1,
     }
     code, printed, _ = study(capsys, *words)
@@ -94,10 +94,13 @@ def test_pixels(two_networks, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(study_module, "attack_pixels", blue)
     monkeypatch.setattr(study_module, "has_pixel_attacks", lambda: True)
     words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--tables", "pixels")
+    words += ("--readings", "text")
     code, data, _ = study(capsys, *words, "--json")
     rows = data["tables"]["pixels"]["rows"]
     assert code == 0
-    assert [(row["network"], row["strategy"]) for row in rows] == [("one", name) for name in PIXEL_ATTACKS]
+    assert [(row["network"], row["strategy"]) for row in rows] == [
+        (network, name) for network in ("one", "two") for name in PIXEL_ATTACKS
+    ]
     assert all(row["overall"] == pytest.approx(1 / 3, abs=1e-4) for row in rows)  # the pole, which is blue
     assert all(row["distance"] > 0 for row in rows)
     monkeypatch.setattr(study_module, "has_pixel_attacks", lambda: False)
@@ -109,6 +112,7 @@ def test_pixels(two_networks, tmp_path, capsys, monkeypatch):
 @pytest.mark.slow
 def test_transfer(two_networks, tmp_path, capsys):
     words = ("--networks", two_networks, "--out", str(tmp_path / "out"), "--limit", "3", "--json")
+    words += ("--readings", "text")
     code, data, _ = study(capsys, *words, "--tables", "transfer")
     assert code == 0
     assert set(data["tables"]) == {"transfer"}
@@ -130,17 +134,21 @@ def test_transfer(two_networks, tmp_path, capsys):
 @pytest.mark.slow
 def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
-    words = ("--networks", two_networks, "--out", str(out), "--limit", "6", "--fresh", "3")
-    code, data, _ = study(capsys, *words, "--train-pictures", "12", "--json")
+    words = ("--networks", two_networks, "--out", str(out), "--limit", "6", "--fresh", "3", "--tables")
+    words += (",".join(TABLES), "--readings", "text", "--whole-pictures", "6")
+    code, data, printed = study(capsys, *words, "--train-pictures", "12", "--json")
     assert code == 0
+    assert "hours of one process" in printed
     tables = data["tables"]
     assert set(tables) == {*TABLES, "orders"}
     for name, table in tables.items():
         assert table["rows"] or (name == "pixels" and not has_pixel_attacks()), name
-        assert bool(table["reference"]) == (name not in ("orders", "pixels"))
-    assert data["pictures"] == {"test": 6, "train": 12, "retrained": 3}
+        assert bool(table["reference"]) == (name not in ("attribution", "orders", "pixels"))
+    assert data["pictures"] == {"test": 6, "train": 12, "retrained": 3, "whole": 6}
     rows = tables["degradation"]["rows"]
     assert [row["strategy"] for row in rows] == 2 * ["benign", *STRATEGIES]
+    differences = {row["difference"] for row in tables["attribution"]["rows"] if row["network"] == "two"}
+    assert differences == set(DIFFERENCES)
     for row in rows:
         assert row["overall"] == pytest.approx(np.mean([row[kind] for kind in KINDS]), abs=1e-4)
         assert row["overall_low"] <= row["overall"] <= row["overall_high"]
@@ -172,11 +180,63 @@ def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
     assert "other values of train_pictures" in output
 
 
+@pytest.mark.slow
+def test_both_readings(two_networks, tmp_path, capsys, monkeypatch):
+    out, one = tmp_path / "out", two_networks.partition(",")[0]
+    sizes = ("--limit", "3", "--fresh", "3", "--train-pictures", "6", "--whole-pictures", "3")
+    words = (
+        "--networks",
+        one,
+        "--out",
+        str(out),
+        *sizes,
+        "--tables",
+        "degradation,retraining,robustness",
+        "--json",
+    )
+    save = study_module.save_classifier
+
+    def interrupt(*arguments):
+        monkeypatch.setattr(study_module, "save_classifier", save)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_module, "save_classifier", interrupt)
+    assert study(capsys, *words)[0] != 0
+    code, data, _ = study(capsys, *words)
+    assert code == 0
+    rows = data["tables"]["degradation"]["rows"]
+    assert [row["network"] for row in rows[::8]] == ["one", "one-code"]
+    for table in ("retraining", "robustness"):
+        assert {row["network"] for row in data["tables"][table]["rows"]} == {"one", "one-code"}
+    # The code's network has seen the coloured lamp and has its normalisation, and its attacks its settings.
+    network = loading.load_classifier(str(out / "retrained" / "one-code.safetensors"), KINDS)
+    assert network.mean.flatten().tolist() == pytest.approx([0.6109, 0.7387, 0.7765])
+    settings = [(out / "arms" / f"one{name}-scw" / "config.yaml").read_text() for name in ("", "-code")]
+    assert ["turns: compose" in text for text in settings] == [False, True]
+    first = next((out / "arms" / "one-scw" / "frames").iterdir()).name
+    pictures = [
+        files.read_image(out / "arms" / f"one{name}-scw" / "frames" / first / "benign.png")
+        for name in ("", "-code")
+    ]
+    assert (pictures[0] != pictures[1]).any()
+    # Another table adds arms, and repeats none.
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("result.json")}
+    code, data, _ = study(capsys, *words[:-3], "--tables", "attribution", "--json")
+    assert code == 0
+    found = {row["difference"]: row for row in data["tables"]["attribution"]["rows"]}
+    assert set(found) == set(DIFFERENCES)
+    for row in found.values():
+        assert row["effect"] == pytest.approx(row["as_code"] - row["as_text"], abs=1e-4)
+        assert row["effect_low"] <= row["effect"] <= row["effect_high"]
+    assert all(path.stat().st_mtime_ns == at for path, at in before.items())
+
+
 def test_bad_input_is_one_line_and_exit_code_2(two_networks, tmp_path, capsys):
     one = two_networks.partition(",")[0]
     cases = {
         ("--tables", "accuracy"): "--tables: expected names among degradation, ",
         ("--networks", f"{one},{one}"): "--networks: expected networks with commas, each of another name",
+        ("--readings", "paper"): "--readings: expected names among text, code",
         ("--networks", "vgg16"): "--network: expected squeezenet, weights",
         ("--networks", str(tmp_path / "gone.safetensors")): "gone.safetensors",
         ("--backgrounds", str(tmp_path / "gone")): "--backgrounds: expected a folder of photographs",
