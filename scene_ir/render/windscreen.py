@@ -33,8 +33,8 @@ def add_drops(image: Tensor, amount: Tensor) -> Tensor:
 @lru_cache(maxsize=8)
 def _place_drops(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Drops in a picture of a size, by the K pixels that they cover: index (K,) int64 of the pixel; the place seen
-    through it (K, 2), as `grid_sample` counts; opacity (K,) in [0, 1]; rank (K,) in [0, 1] of its drop, the order in which they
-    appear.
+    through it (K, 2), as `grid_sample` counts; opacity (K,) in [0, 1]; rank (K,) in [0, 1] of its drop, the order in
+    which they appear.
     """
     rng = np.random.default_rng(19031103)
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
