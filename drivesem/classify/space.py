@@ -177,12 +177,12 @@ class ObjectSpace(ThetaSpace[ClassifyParameter]):
     @property
     def groups(self) -> tuple[ParameterGroup, ...]:
         """Groups of coordinates: gradients are normalised within each."""
-        whole = {str(p): [where] for p, where in self.blocks.items()}
+        whole = {parameter: [where] for parameter, where in self.blocks.items()}
         whole |= {ClassifyParameter.VERTEX: self._parts} if self._parts else {}
-        owners = {str(p): self.owner_count(p) for p in self.blocks}
+        owners = {parameter: self.owner_count(parameter) for parameter in self.blocks}
         return tuple(
-            ParameterGroup(name, where, owners[name] and (where.stop - where.start) // self.specs[name].size)
-            for name, slices in whole.items()
+            ParameterGroup(str(p), where, owners[p] and (where.stop - where.start) // self.specs[p].size)
+            for p, slices in whole.items()
             for where in slices
         )
 

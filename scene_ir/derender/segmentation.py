@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -232,7 +233,7 @@ def _complete_sky(sky: Array, image: Array) -> Array:
     return np.maximum(sky, (weight > _SKY_AROUND) * possible)
 
 
-def _rise(values: Array, ends: tuple[float, float]) -> Array:
+def _rise(values: NDArray[Any], ends: tuple[float, float]) -> NDArray[Any]:
     """0 up to the lower end, 1 from the upper one."""
     return np.clip((values - ends[0]) / (ends[1] - ends[0]), 0, 1)
 

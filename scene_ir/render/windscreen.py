@@ -60,5 +60,6 @@ def _place_drops(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tenso
         rank[area] = np.where(newer, order, rank[area])
         place_xy[area] = np.where(newer[..., None], 2.0 * places - 1.0, place_xy[area])
     pixel = np.flatnonzero(opacity)
-    planes = (place_xy.reshape(-1, 2)[pixel], opacity.reshape(-1)[pixel], rank.reshape(-1)[pixel])
-    return torch.from_numpy(pixel), *(torch.from_numpy(plane) for plane in planes)
+    planes = (pixel, place_xy.reshape(-1, 2)[pixel], opacity.reshape(-1)[pixel], rank.reshape(-1)[pixel])
+    index, places, share, appears = map(torch.from_numpy, planes)
+    return index, places, share, appears
