@@ -120,7 +120,7 @@ def test_transfer(two_networks, tmp_path, capsys):
     assert [(r["source"], r["target"]) for r in rows[::4]] == [("one", "two"), ("two", "one")]
     assert [r["strategy"] for r in rows[:4]] == ["benign", "si-fgsm", "sgd", "scw"]
     assert sorted(path.name for path in (tmp_path / "out" / "arms").iterdir()) == sorted(
-        f"{network}-{method}" for network in ("one", "two") for method in ("si-fgsm", "sgd", "scw")
+        f"{network}-{method}" for network in ("one", "two") for method in ("si-fgsm", "sgd", "scw", "timing")
     )
     # what the second network says of the first one's pictures, looked up anew
     network = loading.load_classifier(two_networks.split(",")[1], KINDS)
