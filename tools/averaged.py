@@ -9,6 +9,7 @@ import csv
 import json
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -172,7 +173,7 @@ class StreetSettings:
 Settings = TypeVar("Settings", bound=StreetSettings)
 
 
-class StreetRun(AveragedRun[Network]):
+class StreetRun(AveragedRun[Network], ABC):
     """A network in training on whole streets."""
 
     settings: StreetSettings
@@ -181,9 +182,9 @@ class StreetRun(AveragedRun[Network]):
         super().__init__(network, settings)
         self.network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
+    @abstractmethod
     def compute_loss(self, store: Any) -> Tensor:
         """The loss () of the next step."""
-        raise NotImplementedError
 
     def step(self, store: Any) -> float:
         """One step of the optimiser, the rate warmed up and falling as a cosine; the loss."""

@@ -264,7 +264,7 @@ def test_pictures_that_are_wrong_are_attacked_and_the_last_counts(monkeypatch, t
     assert "so not attacked" not in page
 
 
-def test_rendered_normalisation_is_kept_with_the_weights(monkeypatch, tmp_path):
+def test_rendered_normalisation_is_stored_with_the_weights(monkeypatch, tmp_path):
     monkeypatch.setitem(loading.ARCHITECTURES, "colours", ColourClassifier)
     network = ColourClassifier()
     network.normalise_by((0.6109, 0.7387, 0.7765), (0.2715, 0.3066, 0.3395))

@@ -98,7 +98,7 @@ def test_placebo_changes_as_much(seed: int) -> None:
     assert np.abs(changed.astype(float) - photograph).mean() == pytest.approx(25, abs=0.6)
 
 
-def test_placebo_of_an_equal_picture_changes_nothing() -> None:
+def test_placebo_of_an_equal_picture_is_that_picture() -> None:
     photograph = np.random.default_rng(1).integers(0, 255, (20, 20, 3)).astype(np.uint8)
     assert (change_as_much(photograph, photograph, np.random.default_rng(0)) == photograph).all()
 
