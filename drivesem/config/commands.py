@@ -841,11 +841,9 @@ class ClassifyConfig(FrameCommandConfig):
     rate: Annotated[float, POSITIVE] | None = None
     """Learning rate (default: 0.003 for the last layer, 0.0001 for all)."""
     normalisation: Literal["network", "rendered"] = "network"
-    """Normalisation of pictures for train, which the weights file keeps: the network's, or the mean and deviation of
-    the rendered set in the paper's code."""
+    """Normalisation of pictures for train: the network's, or the mean and deviation in the paper's code."""
     lamp: Literal["white", "coloured"] = "white"
-    """Lamp: white and near the camera, or as in the paper's code: coloured, 100 object sizes before the object; attacks
-    move its R, G and B apart."""
+    """Lamp: white near the camera, or coloured, 100 sizes off, R, G and B attacked apart, as in the paper's code."""
     half: Annotated[NotNegative, OnlyWith("what", ("train",))] = 0
     """Epochs, from the first, with pictures of half the size, for --layers all."""
     precision: Annotated[Literal["float32", "bfloat16"], OnlyWith("what", ("train",))] = "float32"
@@ -855,11 +853,9 @@ class ClassifyConfig(FrameCommandConfig):
     shape: Literal["each", "smooth"] = "each"
     """Motion of vertices: each by itself as in the paper, or with a 4x4x4 lattice around the object."""
     turns: Literal["add", "compose"] = "add"
-    """Turns of several steps: add pitch, yaw and roll, or compose, each about the mean of the vertices as they stand,
-    as in the paper's code."""
+    """Turns of several steps: add pitch, yaw and roll, or compose about the current centre, as in the paper's code."""
     vertex_groups: Literal["object", "part"] = "object"
-    """Gradients of vertices in sgd and scw are normalised over the object, or over each mesh part (material), as in the
-    paper's code; a part without a finite gradient stays."""
+    """Normalisation of vertex gradients in sgd and scw: over the object, or each part, as in the paper's code."""
     attack_misclassified: Flag = False
     """Also attack pictures that are misclassified unchanged, and let the last iterate count, as in the paper's code."""
     method: Literal["si-fgsm", "sgd", "scw", "random", "halton"] = "si-fgsm"
@@ -869,8 +865,7 @@ class ClassifyConfig(FrameCommandConfig):
     queries: Annotated[Count, OnlyWith("method", ("random", "halton"))] = 5
     """Samples per picture of random and halton."""
     sampled: Literal["pose", "vertex,turn"] = "pose"
-    """What random and halton sample: --params, by default the pose; or vertices within 0.005 and one number within 0.3
-    for pitch, yaw and roll, as in the paper's code."""
+    """Samples of random and halton: of --params, or of vertices and one angle for all turns, as in the paper's code."""
     step_vertex: Annotated[float, POSITIVE] | None = None
     """Step of a vertex, in object sizes (default: the paper's for VGG-16, as for all steps)."""
     step_pose: Annotated[float, POSITIVE] | None = None
