@@ -142,7 +142,7 @@ class VisibilityUnderWeather:
         self._image, self._inverse_depth = render.image.detach()[:, *at], 1 / render.depth.detach()[at]
         nothing = torch.zeros_like(self._inverse_depth)
         sky = environment.sky[at] * (render.object_id[at] == 0)
-        self._environment = replace(environment, sky=sky, road=nothing, foliage_map=nothing)
+        self._environment = replace(environment, sky=sky, road=nothing, foliage_map=nothing, ego=None)
         start = self._contrasts(environment.weather.detach())
         self._min_contrast = np.minimum(_MARGIN * min_contrast, start)
 

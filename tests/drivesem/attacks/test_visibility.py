@@ -1,6 +1,7 @@
 """What a person sees: hand-made pictures of a car on a road."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -147,6 +148,14 @@ def test_objects_not_in_question_stay_visible():
         )
         assert find_invisible(thick).tolist() == [requested]
         assert not find_invisible(np.zeros(4)).any()
+
+
+def test_the_ego_vehicle_of_a_dashcam_changes_no_contrast():
+    render, plain = _seen(0.15, 0.5, away_m=120.0), _environment(CLEAR)
+    dashcam = replace(plain, ego=(torch.arange(HEIGHT)[:, None] > HEIGHT - 10).float().expand(HEIGHT, WIDTH))
+    for environment in (plain, dashcam):
+        find_invisible = VisibilityUnderWeather(render, environment, AIR, np.array([True]), MIN_CONTRAST)
+        assert find_invisible(np.array([1.0, 0, 0, 0])).tolist() == [True]
 
 
 def test_who_is_faint_from_the_start_may_stay_so():
