@@ -163,12 +163,14 @@ def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
     """Format labels, or results if scores (M,) are given.
 
     Values are rounded to 0.001 (scores to 1e-6); alpha follows from yaw and translation. Unknown (NaN) 3D boxes
-    become -1 and -1000. Angles are wrapped to [-pi, pi]. Raises FormatError if `read_labels` would refuse the text.
+    become -1 and -1000. Angles are wrapped to [-pi, pi]. Types of several words (`traffic light`) get underscores, for
+    spaces separate fields. Raises FormatError if `read_labels` would refuse the text.
     """
     if scores is not None and tuple(scores.shape) != (len(labels.kind),):
         raise ShapeError("scores", f"shape {(len(labels.kind),)}", tuple(scores.shape))
     text: list[str] = []
-    for i, kind in enumerate(labels.kind):
+    for i, name in enumerate(labels.kind):
+        kind = "_".join(name.split())
         x, y, z = labels.translation[i].tolist()
         yaw = float(labels.yaw[i])
         pose, alpha = None, math.nan

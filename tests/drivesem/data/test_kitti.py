@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from drivesem.data import kitti, kitti_labels, layouts
-from drivesem.data.classes import count_vehicles
+from drivesem.data.classes import count_vehicles, object_type
 from drivesem.data.ground_truth import SKY_CM, Exposure, FrameLocation
 from drivesem.data.registry import WRITERS, open_dataset
 from scene_ir import files
@@ -237,6 +237,14 @@ def test_unknown_3d_boxes_are_written_as_unknown(tmp_path: Path) -> None:
     labels = labels_of(line, folder=tmp_path)
     assert bool(labels.yaw.isnan().all())
     assert kitti.format_labels(labels) == f"{line}\n"
+
+
+def test_types_of_several_words_keep_their_meaning(tmp_path: Path) -> None:
+    labels = replace(labels_of(CAR, folder=tmp_path), kind=("traffic light",))
+    kitti.write_labels(tmp_path / "b.txt", labels)
+    assert kitti.read_labels(tmp_path / "b.txt").kind == ("traffic_light",)
+    assert object_type("traffic_light") == object_type("traffic light")
+    assert object_type("emergency_vehicle") == object_type("emergency vehicle")
 
 
 def test_nothing_is_written_that_would_not_be_read(tmp_path: Path) -> None:

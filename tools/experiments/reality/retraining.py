@@ -41,7 +41,7 @@ from scene_ir.io import to_tensor
 from scene_ir.render.compositor import Compositor
 from tools.bench.conditions import CONDITIONS, DAY, ConditionSets
 from tools.experiments.reality.observations import ADVERSE, conditions_config
-from tools.experiments.reality.samples import PARAMS
+from tools.experiments.reality.samples import PARAMS, short_name
 from tools.experiments.settings import RealityConfig
 from tools.experiments.tables import RESULTS, read_table, write_table
 
@@ -69,12 +69,11 @@ _UNCHANGED = AugmentSettings(
 )
 _SHARE = 0.5
 """Share of edited pictures in the arms that have some."""
-_TRAINING = RetrainConfig(run="", window="640x384", scale="0.8,1.25", rate=1e-4, precision="bfloat16", warmup=20)
+_TRAINING = RetrainConfig(run="", window="640x384", scale="0.8,1.25", rate=1e-4, precision="float32", warmup=20)
 _LEAST_SCORE = 0.05
 """Detections with lower scores are not stored."""
-_LOSSES = "losses.json"
-DETECTIONS, OBJECTS = "retrain-detections.csv.gz", "retrain-objects.csv.gz"
-"""Tables of the detections and of the objects of each test frame."""
+DETECTIONS, OBJECTS = "retrain-{}-detections.csv.gz", "retrain-{}-objects.csv.gz"
+"""Tables of the detections and of the objects of each test frame, by retrained detector."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,22 +112,24 @@ def run_retraining(config: RealityConfig, out: Path) -> None:
     start = load_start(config.detector, "cpu")
     store = FrameStore(dataset, names, out / "cache" / "days", start.classes)
     arms = [name.strip() for name in config.arms.split(",")]
+    folder = out / "retrained" / short_name(config.detector)
     edits: dict[str, Sequence[Sample]] = {}
     if {"random", "worst"} & set(arms):
-        folders = [edit_day(config, dataset, name, start, out / "edits") for name in names[: config.edited]]
-        edits = {arm: EditedDays(folders, arm == "worst", start.classes) for arm in ("random", "worst")}
+        edited = [edit_day(config, dataset, name, out / "edits") for name in names[: config.edited]]
+        edits["random"] = EditedDays(edited, [0] * len(edited), start.classes)
+        edits["worst"] = EditedDays(edited, find_worst(edited, start, folder / "losses.json"), start.classes)
     detectors = {(START, 0): load_detector(config.detector)}
     for seed in range(config.seeds):
         for arm in arms:
-            weights = out / "retrained" / f"{arm}-seed{seed}" / WEIGHTS
+            weights = folder / f"{arm}-seed{seed}" / WEIGHTS
             if not weights.is_file():
                 _train(config, arm, seed, store, edits.get(arm), weights, console)
             detectors[arm, seed] = load_detector(str(weights))
     _test(config, detectors, out)
 
 
-def edit_day(config: RealityConfig, dataset: Dataset, name: str, detector: Detector, out: Path) -> Path:
-    """De-render a day and draw random states of it, with the detector's loss in each; an empty folder without vehicles.
+def edit_day(config: RealityConfig, dataset: Dataset, name: str, out: Path) -> Path:
+    """De-render a day and draw random states of it; an empty folder without vehicles.
 
     States are feasible within the budget street. Half of the codes of weather lie at an end of their range.
     """
@@ -146,7 +147,6 @@ def edit_day(config: RealityConfig, dataset: Dataset, name: str, detector: Detec
         feasible, compositor = FeasibleSet(space), Compositor(scene)
         labeller = Labeller(scene, compositor.render(scene))
         generator = np.random.default_rng([config.seed, *name.encode()])
-        losses = []
         for k in range(config.states):
             share = torch.from_numpy(generator.uniform(0, 1, space.dim)).float()
             weather = space.blocks[Parameter.WEATHER]
@@ -157,29 +157,47 @@ def edit_day(config: RealityConfig, dataset: Dataset, name: str, detector: Detec
             image, labels, _ = render_state(theta, space, compositor, labeller, scene)
             files.write_png(part / f"{k}.png", image)
             kitti.write_labels(part / f"{k}.txt", labels)
-            targets = training_targets(labels, TRAINING_LIMITS, detector.classes)
-            with torch.no_grad():
-                raw = detector(to_tensor(image)[None])
-                losses.append(round(float(detector.loss(raw, [targets])["total"]), 5))
-        files.write_json(part / _LOSSES, losses)
     return folder
 
 
-class EditedDays(Sequence[Sample]):
-    """One state of each edited day: the first, or the one with the largest loss."""
+def find_worst(folders: Sequence[Path], detector: Detector, path: Path) -> list[int]:
+    """The state of each edited day with the detector's largest loss; losses are stored in a file."""
+    losses: dict[str, list[float]] = files.read_json(path) if path.is_file() else {}
+    for folder in folders:
+        if folder.name not in losses:
+            losses[folder.name] = [_loss(detector, picture) for picture in _pictures(folder)]
+            files.write_json(path, losses)
+    return [int(np.argmax(losses[folder.name] or [0.0])) for folder in folders]
 
-    def __init__(self, folders: Sequence[Path], worst: bool, classes: Sequence[str]) -> None:
-        chosen = [(one, files.read_json(one / _LOSSES)) for one in folders if (one / _LOSSES).is_file()]
-        self._paths = [folder / f"{int(np.argmax(losses)) if worst else 0}.png" for folder, losses in chosen]
+
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.png"), key=lambda path: int(path.stem))
+
+
+def _loss(detector: Detector, picture: Path) -> float:
+    image, targets = _read_edit(picture, detector.classes)
+    with torch.no_grad():
+        return round(float(detector.loss(detector(to_tensor(image)[None]), [targets])["total"]), 5)
+
+
+def _read_edit(picture: Path, classes: Sequence[str]) -> Sample:
+    labels = kitti.read_labels(picture.with_suffix(".txt"))
+    return files.read_image(picture), training_targets(labels, TRAINING_LIMITS, classes)
+
+
+class EditedDays(Sequence[Sample]):
+    """One state of each edited day that has vehicles."""
+
+    def __init__(self, folders: Sequence[Path], states: Sequence[int], classes: Sequence[str]) -> None:
+        pairs = zip(folders, states, strict=True)
+        self._paths = [_pictures(folder)[state] for folder, state in pairs if _pictures(folder)]
         self._classes = classes
 
     def __len__(self) -> int:
         return len(self._paths)
 
     def __getitem__(self, index: int) -> Sample:  # pyright: ignore[reportIncompatibleMethodOverride]
-        path = self._paths[index]
-        labels = kitti.read_labels(path.with_suffix(".txt"))
-        return files.read_image(path), training_targets(labels, TRAINING_LIMITS, self._classes)
+        return _read_edit(self._paths[index], self._classes)
 
 
 def _train(
@@ -228,17 +246,19 @@ def _test(config: RealityConfig, detectors: dict[tuple[str, int], Detector], out
                 ]
                 for name, count in zip(names, matches.objects, strict=True):
                     frames[name] = RetrainTestFrame(condition, name, int(count))
-    write_table(out / RESULTS / DETECTIONS, (ArmDetection,), detections)
-    write_table(out / RESULTS / OBJECTS, (RetrainTestFrame,), [(frame,) for frame in frames.values()])
+    name = short_name(config.detector)
+    write_table(out / RESULTS / DETECTIONS.format(name), (ArmDetection,), detections)
+    write_table(out / RESULTS / OBJECTS.format(name), (RetrainTestFrame,), [(frame,) for frame in frames.values()])
 
 
-def read_matches(folder: Path) -> tuple[dict[tuple[str, int], ClassMatches], list[RetrainTestFrame]]:
+def read_matches(folder: Path, detector: str) -> tuple[dict[tuple[str, int], ClassMatches], list[RetrainTestFrame]]:
     """Read the matches of each arm and seed in all test frames, and the frames. Raises FormatError."""
-    frames: list[RetrainTestFrame] = [row[0] for row in read_table(folder / OBJECTS, (RetrainTestFrame,))]
+    table = read_table(folder / OBJECTS.format(detector), (RetrainTestFrame,))
+    frames: list[RetrainTestFrame] = [row[0] for row in table]
     place = {frame.frame: i for i, frame in enumerate(frames)}
     objects = np.array([frame.objects for frame in frames], np.float64)
     by_arm: dict[tuple[str, int], list[ArmDetection]] = {}
-    for (one,) in read_table(folder / DETECTIONS, (ArmDetection,)):
+    for (one,) in read_table(folder / DETECTIONS.format(detector), (ArmDetection,)):
         by_arm.setdefault((one.arm, one.seed), []).append(one)
     matches = {}
     for key, found in by_arm.items():
