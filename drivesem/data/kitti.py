@@ -163,8 +163,8 @@ def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
     """Format labels, or results if scores (M,) are given.
 
     Values are rounded to 0.001 (scores to 1e-6); alpha follows from yaw and translation. Unknown (NaN) 3D boxes
-    become -1 and -1000. Angles are wrapped to [-pi, pi]. Types of several words (`traffic light`) get underscores, for
-    spaces separate fields. Raises FormatError if `read_labels` would refuse the text.
+    become -1 and -1000, unknown truncation 0. Angles are wrapped to [-pi, pi]. Types of several words (`traffic light`)
+    get underscores, as spaces separate fields. Raises FormatError if `read_labels` would refuse the text.
     """
     if scores is not None and tuple(scores.shape) != (len(labels.kind),):
         raise ShapeError("scores", f"shape {(len(labels.kind),)}", tuple(scores.shape))
@@ -177,7 +177,8 @@ def format_labels(labels: Labels, scores: Tensor | None = None) -> str:
         if is_known_pose((*labels.size_lhw[i].tolist(), x, y, z, yaw)):
             pose = [*_round([*labels.size_lhw[i].tolist(), x, y, z]), _wrap_angle(yaw)]
             alpha = _wrap_angle(yaw - math.atan2(x, z))
-        truncation, box = round(float(labels.truncation[i]), 3), _round(labels.boxes_xyxy[i].tolist())
+        cut = float(labels.truncation[i])
+        truncation, box = 0.0 if math.isnan(cut) else round(cut, 3), _round(labels.boxes_xyxy[i].tolist())
         score = None if scores is None else f"{float(scores[i]):.6f}"
         text.append(_format_line(kind, truncation, int(labels.occlusion[i]), alpha, box, pose, score))
     if scores is None:

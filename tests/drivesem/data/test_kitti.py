@@ -239,10 +239,13 @@ def test_unknown_3d_boxes_are_written_as_unknown(tmp_path: Path) -> None:
     assert kitti.format_labels(labels) == f"{line}\n"
 
 
-def test_types_of_several_words_keep_their_meaning(tmp_path: Path) -> None:
-    labels = replace(labels_of(CAR, folder=tmp_path), kind=("traffic light",))
+def test_objects_of_other_data_sets_can_be_written(tmp_path: Path) -> None:
+    """Types of several words and unknown truncation, as BDD100K's traffic lights have."""
+    unknown = torch.tensor([math.nan])
+    labels = replace(labels_of(CAR, folder=tmp_path), kind=("traffic light",), truncation=unknown)
     kitti.write_labels(tmp_path / "b.txt", labels)
-    assert kitti.read_labels(tmp_path / "b.txt").kind == ("traffic_light",)
+    back = kitti.read_labels(tmp_path / "b.txt")
+    assert (back.kind, float(back.truncation[0])) == (("traffic_light",), 0.0)
     assert object_type("traffic_light") == object_type("traffic light")
     assert object_type("emergency_vehicle") == object_type("emergency vehicle")
 

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 _MARKERS = "osD^vP"
 
 
-def _create(width: float, height: float, columns: int = 1) -> tuple[Figure, list[Axes]]:
+def _create(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, list[Axes]]:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     with mpl.rc_context(dict(PLOT_STYLE)):  # pyright: ignore[reportArgumentType]
         figure = Figure(figsize=(width, height), layout="constrained")
-        axes = [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
+        axes = [figure.add_subplot(rows, columns, i + 1) for i in range(rows * columns)]
     return figure, axes
 
 
@@ -88,19 +88,24 @@ def plot_lifts(path: Path, names: Sequence[str], rules: Sequence[RuleLift], plac
     write_figure(path, figure)
 
 
-def plot_retraining(path: Path, arms: Mapping[str, Mapping[str, Interval]], titles: Mapping[str, str]) -> None:
-    """Plot average precisions with intervals by set of frames and arm."""
-    sets = list(next(iter(arms.values())))
-    figure, (axes,) = _create(9.0, 4.4)
-    for k, (arm, values) in enumerate(arms.items()):
-        place = np.arange(len(sets)) + 0.13 * (k - (len(arms) - 1) / 2)
-        for x, name in zip(place, sets, strict=True):
-            one = values[name]
-            if one.value is not None and one.low is not None and one.high is not None:
-                axes.plot([x, x], [100 * one.low, 100 * one.high], color=PLOT_COLOURS[k], linewidth=1.4)
-                axes.plot([x], [100 * one.value], "o", color=PLOT_COLOURS[k], markersize=5)
-        axes.plot([], [], "o", color=PLOT_COLOURS[k], label=titles[arm])
-    axes.set_xticks(range(len(sets)), sets)
-    axes.set_ylabel("AP50 of cars, %")
-    figure.legend(loc="outside lower center", ncols=len(arms), fontsize=9)
+def plot_retraining(
+    path: Path, detectors: Mapping[str, Mapping[str, Mapping[str, Interval]]], titles: Mapping[str, str]
+) -> None:
+    """Plot average precisions with intervals by set of frames and arm, a panel for each detector."""
+    figure, panels = _create(9.0, 1.0 + 3.2 * len(detectors), rows=len(detectors))
+    for axes, (detector, arms) in zip(panels, detectors.items(), strict=True):
+        sets = list(next(iter(arms.values())))
+        for k, (arm, values) in enumerate(arms.items()):
+            place = np.arange(len(sets)) + 0.13 * (k - (len(arms) - 1) / 2)
+            for x, name in zip(place, sets, strict=True):
+                one = values[name]
+                if one.value is not None and one.low is not None and one.high is not None:
+                    axes.plot([x, x], [100 * one.low, 100 * one.high], color=PLOT_COLOURS[k], linewidth=1.4)
+                    axes.plot([x], [100 * one.value], "o", color=PLOT_COLOURS[k], markersize=5)
+            if axes is panels[0]:
+                axes.plot([], [], "o", color=PLOT_COLOURS[k], label=titles[arm])
+        axes.set_xticks(range(len(sets)), sets)
+        axes.set_ylabel("AP50 of cars, %")
+        axes.set_title(detector, fontsize=10)
+    figure.legend(loc="outside lower center", ncols=5, fontsize=9)
     write_figure(path, figure)

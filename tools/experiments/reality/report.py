@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from drivesem.evaluation.curves import ClassMatches
+from drivesem.evaluation.instances import Floats
 from drivesem.evaluation.resampling import (
     Interval,
     NamedMetric,
@@ -36,6 +37,8 @@ from tools.experiments.tables import METADATA
 
 DRAWS = 1000
 """Default number of bootstrap draws."""
+LEAST_PRECISION = 0.8
+"""Precision at which the recalls of retrained detectors are compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +81,43 @@ class RealityResults:
     """Lifts of rules, placebos, and rules within conditions, for the attacked detector's misses."""
     transfer: Mapping[tuple[str, str], Sequence[RuleLift]]
     """Lifts by attacked detector, and detector that misses."""
+    retrained: Sequence[RetrainedArms]
+    """Metrics of the arms by detector; empty without retraining."""
+
+
+@dataclass(frozen=True, slots=True)
+class RetrainedArms:
+    """A metric of the arms of one retrained detector."""
+
+    detector: str
+    """Name of the detector."""
+    metric: str
+    """AP50 or RECALL."""
     arms: Mapping[str, Mapping[str, Interval]]
-    """Metrics of each arm by set of frames; empty without retraining."""
+    """Values of each arm by set of frames."""
     differences: Mapping[str, Mapping[str, Interval]]
     """Differences of an arm to the usual augmentation, by set of frames."""
 
 
+AP50, RECALL = "AP50", f"recall at a precision of {LEAST_PRECISION:.0%}"
+
+
+@dataclass(frozen=True, slots=True)
+class RecallAtPrecision(WeightedAveragePrecision):
+    """Largest recall of one class at which the precision is at least LEAST_PRECISION, under weights of the frames."""
+
+    def value(self, weights: Floats | None) -> float | None:
+        """The metric under weights (F,) of the frames; None where no object is drawn."""
+        objects = self.matches.object_count(weights)
+        if objects <= 0:
+            return None
+        hits, alarms = self.matches.cumulative_counts(weights)
+        precise = (hits > 0) & (hits >= LEAST_PRECISION * (hits + alarms))
+        return float(hits[precise].max(initial=0.0)) / objects
+
+
+METRICS = {AP50: WeightedAveragePrecision, RECALL: RecallAtPrecision}
+"""Metrics of retrained detectors."""
 RULES, PLACEBOS, WITHIN = "rules", "placebos", "rules, within conditions"
 
 
@@ -120,9 +154,11 @@ def load_results(folder: Path, draws: int, seed: int) -> RealityResults:
         for attacked in dict.fromkeys(rule.detector for rule in rules)
         for missing in detectors
     }
-    arms, differences = {}, {}
-    if (folder / retraining.DETECTIONS).is_file():
-        arms, differences = _evaluate_arms(folder, draws, seed)
+    retrained = [
+        _evaluate_arms(folder, name, metric, draws, seed)
+        for name in retraining.retrained_detectors(folder)
+        for metric in METRICS
+    ]
     return RealityResults(
         record=files.read_json(folder / METADATA),
         detectors=detectors,
@@ -131,16 +167,13 @@ def load_results(folder: Path, draws: int, seed: int) -> RealityResults:
         rules=rules,
         lifts={RULES: lifts("where"), PLACEBOS: lifts("placebo"), WITHIN: lifts("where", True)},
         transfer=transfer,
-        arms=arms,
-        differences=differences,
+        retrained=retrained,
     )
 
 
-def _evaluate_arms(
-    folder: Path, draws: int, seed: int
-) -> tuple[dict[str, dict[str, Interval]], dict[str, dict[str, Interval]]]:
-    """Average precision of each arm by condition, and its difference to the usual augmentation."""
-    matches, frames = retraining.read_matches(folder)
+def _evaluate_arms(folder: Path, detector: str, metric: str, draws: int, seed: int) -> RetrainedArms:
+    """A metric of each arm by condition, and its difference to the usual augmentation; means over seeds."""
+    matches, frames = retraining.read_matches(folder, detector)
     condition = np.array([frame.condition for frame in frames])
     sets = {name: (name,) for name in dict.fromkeys(condition)} | {MEAN: ADVERSE}
     metrics: dict[str, list[NamedMetric]] = {}
@@ -150,7 +183,7 @@ def _evaluate_arms(
             NamedMetric(
                 title,
                 tuple(
-                    WeightedAveragePrecision(_restrict(one, condition == name), "coco")
+                    METRICS[metric](_restrict(one, condition == name), "coco")
                     for one in of_arm
                     for name in names
                     if (condition == name).any()
@@ -171,7 +204,7 @@ def _evaluate_arms(
         for arm, own in metrics.items()
         if arm != "usual" and "usual" in metrics
     }
-    return arms, differences
+    return RetrainedArms(detector, metric, arms, differences)
 
 
 MEAN = "mean of adverse"
@@ -198,8 +231,8 @@ def build_report(results: RealityResults, out: Path) -> AnalysisReport:
         _count_table(results),
         _transfer_table(results),
     ]
-    if results.arms:
-        tables += [_arm_table(results), _difference_table(results)]
+    for one in results.retrained:
+        tables += [_arm_table(one), _difference_table(one)]
     data = {
         **results.record,
         "agreement": {name: _to_values(one) for name, one in results.agreements.items()},
@@ -207,6 +240,17 @@ def build_report(results: RealityResults, out: Path) -> AnalysisReport:
             kind: [{"lift": one.lift.value, "low": one.lift.low, "high": one.lift.high} for one in lifts]
             for kind, lifts in results.lifts.items()
         },
+        "retrained": [
+            {
+                "detector": one.detector,
+                "metric": one.metric,
+                **{
+                    key: {arm: {k: [v.value, v.low, v.high] for k, v in row.items()} for arm, row in part.items()}
+                    for key, part in (("arms", one.arms), ("differences", one.differences))
+                },
+            }
+            for one in results.retrained
+        ],
     }
     return AnalysisReport(
         out=out,
@@ -226,8 +270,9 @@ def write_plots(results: RealityResults, out: Path) -> None:
     plot_losses(out / "losses.png", results.losses)
     names = [f"{rule.detector}: {format_rule(rule.where)}" for rule in results.rules]
     plot_lifts(out / "lifts.png", names, results.lifts[RULES], results.lifts[PLACEBOS])
-    if results.arms:
-        plot_retraining(out / "retraining.png", results.arms, retraining.ARM_TITLES)
+    if results.retrained:
+        panels = {one.detector: one.arms for one in results.retrained if one.metric == AP50}
+        plot_retraining(out / "retraining.png", panels, retraining.ARM_TITLES)
 
 
 def _to_values(agreement: Agreement) -> dict[str, list[float | None]]:
@@ -340,19 +385,19 @@ def _transfer_table(results: RealityResults) -> ReportTable:
     return ReportTable("Rules of one detector, misses of others", columns, tuple(rows))
 
 
-def _arm_table(results: RealityResults) -> ReportTable:
-    sets = list(next(iter(results.arms.values())))
-    rows = tuple(
-        (retraining.ARM_TITLES[arm], *(format_interval(values[name], 100, 1) for name in sets))
-        for arm, values in results.arms.items()
-    )
-    return ReportTable("AP50 of cars on real frames, %", ("arm", *sets), rows)
+def _arm_table(one: RetrainedArms) -> ReportTable:
+    return _table_of_arms(f"{one.detector}: {one.metric} of cars on real frames, %", one.arms)
 
 
-def _difference_table(results: RealityResults) -> ReportTable:
-    sets = list(next(iter(results.arms.values())))
+def _difference_table(one: RetrainedArms) -> ReportTable:
+    title = f"{one.detector}: {one.metric}, points, less that of the usual augmentation"
+    return _table_of_arms(title, one.differences)
+
+
+def _table_of_arms(title: str, arms: Mapping[str, Mapping[str, Interval]]) -> ReportTable:
+    sets = list(next(iter(arms.values())))
     rows = tuple(
         (retraining.ARM_TITLES[arm], *(format_interval(values[name], 100, 1) for name in sets))
-        for arm, values in results.differences.items()
+        for arm, values in arms.items()
     )
-    return ReportTable("AP50, points, less that of the usual augmentation", ("arm", *sets), rows)
+    return ReportTable(title, ("arm", *sets), rows)

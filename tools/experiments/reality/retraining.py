@@ -251,7 +251,17 @@ def _test(config: RealityConfig, detectors: dict[tuple[str, int], Detector], out
     write_table(out / RESULTS / OBJECTS.format(name), (RetrainTestFrame,), [(frame,) for frame in frames.values()])
 
 
-def read_matches(folder: Path, detector: str) -> tuple[dict[tuple[str, int], ClassMatches], list[RetrainTestFrame]]:
+def retrained_detectors(folder: Path) -> list[str]:
+    """Names of the detectors with tables in a folder."""
+    before, after = DETECTIONS.split("{}")
+    return [
+        path.name.removeprefix(before).removesuffix(after) for path in sorted(folder.glob(DETECTIONS.format("*")))
+    ]
+
+
+def read_matches(
+    folder: Path, detector: str
+) -> tuple[dict[tuple[str, int], ClassMatches], list[RetrainTestFrame]]:
     """Read the matches of each arm and seed in all test frames, and the frames. Raises FormatError."""
     table = read_table(folder / OBJECTS.format(detector), (RetrainTestFrame,))
     frames: list[RetrainTestFrame] = [row[0] for row in table]

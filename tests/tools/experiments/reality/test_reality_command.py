@@ -50,14 +50,14 @@ def write_results(folder: Path) -> None:
     rule = {"detector": "a", "objects": 3, "where": {"contrast": [0.0, 0.08]}, "placebo": {"across": [0.0, 0.4]}}
     files.write_json(folder / "rules.json", [rule, rule | {"where": {"across": [0.4, 0.6]}}])
     frames = [RetrainTestFrame(condition, f"{condition}{i}", 2) for condition in (DAY, *ADVERSE) for i in range(4)]
-    write_table(folder / OBJECTS, (RetrainTestFrame,), [(frame,) for frame in frames])
+    write_table(folder / OBJECTS.format("a"), (RetrainTestFrame,), [(frame,) for frame in frames])
     found = [
         ArmDetection(arm, 0, frame.frame, round(0.9 - 0.01 * k, 2), k <= number)
         for number, arm in enumerate(ARMS)
         for frame in frames
         for k in range(2)
     ]
-    write_table(folder / DETECTIONS, (ArmDetection,), [(one,) for one in found])
+    write_table(folder / DETECTIONS.format("a"), (ArmDetection,), [(one,) for one in found])
     files.write_json(folder / METADATA, {"settings": {"name": "reality"}, "seconds": {}})
 
 
@@ -82,7 +82,7 @@ def test_tables_are_read_back(tmp_path: Path) -> None:
     write_results(tmp_path)
     rows = read_observations(tmp_path / TABLE.format("B"))
     assert {one.condition for one, _ in rows} == {DAY, UNDRAWN, *ADVERSE}
-    matches, frames = read_matches(tmp_path)
+    matches, frames = read_matches(tmp_path, "a")
     assert len(frames) == 24
     assert {arm for arm, _ in matches} == set(ARMS)
     assert [int(matches[arm, 0].true_positives.sum()) for arm in ARMS] == [24, 48, 48, 48]
