@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
 import platform
@@ -13,6 +14,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -194,6 +196,18 @@ def lingering(folder: str) -> Callable[[int], None]:
     return partial(linger, folder=folder)
 
 
+_locks: list[Any] = []
+
+
+def lock(job: int, folder: str) -> None:
+    """Make a lock of processes, as progress bars of other packages do."""
+    _locks.append(multiprocessing.RLock())
+
+
+def locking(folder: str) -> Callable[[int], None]:
+    return partial(lock, folder=folder)
+
+
 # As in a terminal: what a shell starts in the background ignores Ctrl-C.
 _STOPPED = """
 import signal
@@ -201,16 +215,16 @@ from functools import partial
 
 from drivesem.run.workers import run_jobs
 from drivesem.config.options import WorkerOptions
-from tests.drivesem.run.test_workers import lingering
+from tests.drivesem.run.test_workers import {build}
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
-list(run_jobs(None, partial(lingering, {folder!r}), [1, 2], WorkerOptions(workers=2)))
+list(run_jobs(None, partial({build}, {folder!r}), [1, 2], WorkerOptions(workers=2)))
 """
 
 
-def parent_of_workers(folder: Path) -> subprocess.Popen[str]:
+def parent_of_workers(folder: Path, build: str = "lingering") -> subprocess.Popen[str]:
     """A script in a session of its own, whose two workers say in `folder` that they work."""
-    (folder / "stopped.py").write_text(_STOPPED.format(folder=str(folder)))
+    (folder / "stopped.py").write_text(_STOPPED.format(folder=str(folder), build=build))
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     command = [sys.executable, str(folder / "stopped.py")]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -262,6 +276,13 @@ def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_pa
         took, output = time.monotonic() - start, parent.stderr.read()
     assert took < 5
     assert output.count("Traceback") == (number == signal.SIGINT), "of the script itself, which catches nothing"
+
+
+def test_workers_that_are_done_leave_no_semaphores(tmp_path: Path) -> None:
+    with parent_of_workers(tmp_path, "locking") as parent:
+        assert parent.stderr is not None
+        assert parent.stderr.read() == ""
+    assert parent.returncode == 0
 
 
 def _lives(pid: int) -> bool:
