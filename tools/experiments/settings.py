@@ -196,9 +196,10 @@ class FidelityConfig(SeededBootstrapOptions, CommandConfig):
 class RealityConfig(SeededBootstrapOptions, CommandConfig):
     """Compare failures on dry-day photographs with failures in real fog, rain, snow, dusk and night."""
 
-    part: tyro.conf.Positional[Literal["attack", "rules", "observe", "retrain", "report"]] = "report"
+    part: tyro.conf.Positional[Literal["attack", "rules", "observe", "retrain", "survey", "report"]] = "report"
     """attack: attack days of half A and sample objects; rules: fix the rules; observe: run detectors on the frames of
-    --half; retrain: train the arms and test them; report: compute the tables."""
+    --half; retrain: train the arms and test them; survey: write a page that asks people about certain failures and
+    real misses; report: compute the tables."""
     out: str | None = None
     """Folder of the results; the same command resumes what it finds there."""
     results: Annotated[str | None, ExistingFolder(), tyro.conf.arg(aliases=["--from"])] = None
@@ -261,6 +262,8 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
     """retrain: pictures per step."""
     seeds: Count = 1
     """retrain: seeds of each arm."""
+    items: Count = 40
+    """survey: questions of each kind."""
     test: Count = 40
     """retrain: most real frames of each condition of half B to test on."""
 
@@ -269,7 +272,12 @@ class RealityConfig(SeededBootstrapOptions, CommandConfig):
         refuse(self.part != "report" and self.results is not None, "--from", "none but with report", self.part)
         refuse(self.part != "report" and self.out is None, "--out", "a folder", "none")
         refuse(self.part == "report" and self.out is self.results is None, "--from", "a folder, or --out", "none")
-        refuse(self.part in ("attack", "observe", "retrain") and self.root is None, "--root", "a folder", "none")
+        refuse(
+            self.part in ("attack", "observe", "retrain", "survey") and self.root is None,
+            "--root",
+            "a folder",
+            "none",
+        )
         refuse(self.part == "retrain" and self.train_root is None, "--train-root", "a folder", "none")
 
 

@@ -54,6 +54,10 @@ def run_reality(config: RealityConfig) -> AnalysisReport | int:
             facts["opened_b"] = _now()
             _record(config, results, facts)  # before anything of half B is read
         observe_half(config, config.half, results / TABLE.format(config.half))
+    elif config.part == "survey":
+        from tools.experiments.reality.survey import write_reality_survey
+
+        facts["survey"] = write_reality_survey(config, out)
     else:
         from tools.experiments.reality.retraining import run_retraining
 

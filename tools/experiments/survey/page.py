@@ -33,8 +33,9 @@ from tools.experiments.settings import SurveyConfig
 
 PAGE, KEY = "survey.html", "survey-key.json"
 """Files of a survey: the page for people, and the key to its pictures."""
-CHANGED, UNCHANGED = "counterexample", "unchanged"
-KINDS = (CHANGED, UNCHANGED)
+CHANGED, UNCHANGED, PHOTOGRAPH = "counterexample", "unchanged", "photograph"
+KINDS = (CHANGED, UNCHANGED, PHOTOGRAPH)
+"""Kinds of pictures; photographs, of which there is no other version, come from `experiments reality`."""
 OTHER, NOT_SURE = "Other", "Not sure"
 _CATEGORY_TEXTS = {
     "Car": "car or van",
@@ -57,6 +58,9 @@ _LEAST_HW = (180, 320)
 """px; smaller crops of far vehicles would be mostly vehicle and blur."""
 _PICTURE_WIDTH_PX = 640
 """Pictures are enlarged to it, so that all have one size."""
+
+
+Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +87,10 @@ class SurveyItem:
 class SurveyPicture:
     """The pictures of one question."""
 
-    original: Picture
-    """Crop of the photograph (h, w, 3) uint8."""
+    original: Picture | None
+    """Crop of the photograph (h, w, 3) uint8; None if `changed` is one."""
     changed: Picture
-    """Crop of the changed picture (h, w, 3) uint8."""
+    """Crop of the picture to rate (h, w, 3) uint8."""
     outline_xyxy: tuple[float, float, float, float]
     """Box of the vehicle, fractions of the crop."""
 
@@ -166,14 +170,20 @@ def _visible_vehicles(frame: RunFrame, kind: str) -> list[tuple[BoxRecord, BoxRe
 def _crop_pictures(frame: RunFrame, kind: str, before: BoxRecord, after: BoxRecord) -> SurveyPicture:
     original = files.read_image(frame.pictures["benign"])
     changed = files.read_image(frame.pictures["attacked" if kind == CHANGED else "rerendered"])
-    height, width = original.shape[:2]
     box = after.xyxy if kind == CHANGED else before.xyxy
-    x0, y0, x1, y1 = enclosing_rectangle((before.xyxy, box))
+    return crop_pictures(original, changed, box, enclosing_rectangle((before.xyxy, box)))
+
+
+def crop_pictures(original: Picture | None, changed: Picture, box: Box, shown: Box | None = None) -> SurveyPicture:
+    """Crop pictures (H, W, 3) uint8 around the rectangle `shown`, by default the vehicle's box (xyxy, px)."""
+    height, width = changed.shape[:2]
+    x0, y0, x1, y1 = shown or box
     rows, columns = _crop_span(y0, y1, height, _LEAST_HW[0]), _crop_span(x0, x1, width, _LEAST_HW[1])
     top, left, h, w = rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start
     outline = ((box[0] - left) / w, (box[1] - top) / h, (box[2] - left) / w, (box[3] - top) / h)
     x0, y0, x1, y1 = (float(np.clip(value, 0, 1)) for value in outline)
-    return SurveyPicture(_enlarge(original[rows, columns]), _enlarge(changed[rows, columns]), (x0, y0, x1, y1))
+    before = None if original is None else _enlarge(original[rows, columns])
+    return SurveyPicture(before, _enlarge(changed[rows, columns]), (x0, y0, x1, y1))
 
 
 def _crop_span(low: float, high: float, length: int, least: int) -> slice:
@@ -198,7 +208,7 @@ def render_page(items: Sequence[tuple[SurveyItem, SurveyPicture]]) -> str:
     pictures = [
         {
             "item": item.item,
-            "original": encode_jpeg_data_url(view.original),
+            "original": view.original is not None and encode_jpeg_data_url(view.original),
             "changed": encode_jpeg_data_url(view.changed),
             "outline": view.outline_xyxy,
         }
@@ -212,6 +222,16 @@ def render_page(items: Sequence[tuple[SurveyItem, SurveyPicture]]) -> str:
         {"count": len(items), "choices": CHOICES, "least": LEAST, "most": MOST},
     )
     return web.render_page(f"{home}:survey.html", f"{home}:survey.js", data=data, **facts)
+
+
+def write_survey(
+    out: Path, questions: Sequence[tuple[SurveyItem, SurveyPicture]], facts: Mapping[str, Any]
+) -> float:
+    """Write the page, and its key with further entries, to a folder. Returns the page's size, MB."""
+    page = render_page(questions)
+    files.write_text(out / PAGE, page)
+    write_key(out / KEY, [item for item, _ in questions], facts)
+    return round(len(page) / 1e6, 2)
 
 
 def write_key(path: Path, items: Sequence[SurveyItem], facts: Mapping[str, Any]) -> None:
@@ -277,14 +297,12 @@ def run_survey(config: SurveyConfig) -> int:
     out = resolve_output_folder(config.out, runs[0].folder / "survey")
     questions = draw_items(runs, config.items, config.controls, config.seed)
     items = [item for item, _ in questions]
-    page = render_page(questions)
-    files.write_text(out / PAGE, page)
-    write_key(out / KEY, items, {"runs": [str(run.folder) for run in runs], "seed": config.seed})
+    megabytes = write_survey(out, questions, {"runs": [str(run.folder) for run in runs], "seed": config.seed})
     counts = {kind: sum(item.kind == kind for item in items) for kind in KINDS}
     data = {"survey": survey_name(items), "page": str(out / PAGE), "key": str(out / KEY), **counts}
     console = Console(stderr=True)
     if config.json:
-        print_json(data | {"megabytes": round(len(page) / 1e6, 2)})
+        print_json(data | {"megabytes": megabytes})
     if counts[CHANGED] < config.items:
         wanted = format_count(config.items, "picture")
         console.print(f"only {counts[CHANGED]} of {wanted}: the runs have no more", soft_wrap=True)

@@ -27,7 +27,8 @@ function showQuestion() {
   part("naming").reset();
   part("rating").reset();
   part("single").src = part("right").src = one.changed;
-  part("left").src = one.original;
+  part("left").src = one.original || "";
+  part("before").hidden = !one.original;
   const [x0, y0, x1, y1] = one.outline.map((value) => 100 * value);
   Object.assign(part("outline").style,
     { left: x0 + "%", top: y0 + "%", width: x1 - x0 + "%", height: y1 - y0 + "%" });
