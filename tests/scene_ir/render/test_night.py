@@ -166,3 +166,17 @@ def test_glare_grows_with_fog(check_code_gradient: Callable[[Callable[[Tensor], 
     check_code_gradient(function, code[used])
     foggier = code + torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     assert bool((_apply(inputs, foggier, maps) >= _apply(inputs, code, maps)).all())
+
+
+def test_no_lamp_hangs_in_the_sky_near_by(photographed: SceneIR) -> None:
+    """Lamps have no posts, so those high above the horizon are left out."""
+    camera, up = photographed.camera.matrix.double(), photographed.environment.ground[:3].double()
+    height, width = photographed.camera.height, photographed.camera.width
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    rays = torch.stack([columns.double(), rows.double(), torch.ones(height, width).double()]).flatten(1)
+    rays = torch.linalg.inv(camera[:, :3]) @ rays
+    rise = ((up @ rays) / rays.norm(dim=0)).asin().rad2deg().reshape(height, width)
+    lamps = torch.from_numpy(night._street_lamps(photographed, torch.full((height, width), 1e9).numpy()))
+    shown = lamps.sum(dim=2) > 0.5
+    assert shown.any()
+    assert 0 < float(rise[shown].max()) < 14
