@@ -279,7 +279,7 @@ as a camera's exposure by night does not depend on that by day.
 """
 BY_DAY = (0.07, 0.12)
 """Mean light of a photograph that is taken by night, which the code hardly changes, and of one by day."""
-STREET_LAMP_M, STREET_ASIDE_M, STREET_EVERY_M, STREET_FAR_M, STREET_SHOWN_M = 8.0, 7.0, 36.0, 320.0, 50.0
+STREET_LAMP_M, STREET_ASIDE_M, STREET_EVERY_M, STREET_FAR_M, STREET_VISIBLE_M = 8.0, 7.0, 36.0, 320.0, 50.0
 """Height of street lamps; their distance from the camera's path, alternately left and right; distance along it on
 each side, and of the farthest; distance from which they are visible: a nearer one would hang in the sky, for want of
 a post.

@@ -222,7 +222,7 @@ def _street_lamps(scene: SceneIR, depth_m: np.ndarray) -> np.ndarray:
     ground = scene.environment.ground.double().cpu().numpy()
     matrix = scene.camera.matrix.double().cpu().numpy()
     down = -ground[:3]
-    far = [(x, z) for x, z in _street_posts() if z >= model.STREET_SHOWN_M]
+    far = [(x, z) for x, z in _street_posts() if z >= model.STREET_VISIBLE_M]
     posts = [(x, model.STREET_LAMP_M, z, model.STREET_LAMP_RGB) for x, z in far]
     for x, high, z, colour in posts + _other_lamps():
         # on the ground below, then up
