@@ -77,6 +77,8 @@ from tools.experiments.worth.points import PREFERRED_DISTANCES
 PICTURES = "pictures"
 """Folder of the pictures to train on."""
 EPOCHS = 20
+_WHOLE_EPOCHS = {False: EPOCHS, True: 4}
+"""Epochs of training whole networks, by default and with --quick."""
 _MOST_PASSES = 1 + 5 * (GRADIENT_PASSES + 1)
 """Passes of the network in an attack of five steps that does not stop early."""
 _TABLE_STRATEGIES = {
@@ -284,7 +286,8 @@ class ClassificationStudy:
         if settings.get("normalisation") == "rendered" and network.takes_normalisation:
             learner.normalise_by(RENDERED_MEAN, RENDERED_STD)
         options = {one: settings[one] for one in DIFFERENCES["training"][0] if one in settings}
-        config = ClassifyConfig(what="train", device=self.study.device, **{"epochs": EPOCHS, **options})
+        options["epochs"] = _WHOLE_EPOCHS[self.study.quick] if options.get("layers") == "all" else EPOCHS
+        config = ClassifyConfig(what="train", device=self.study.device, **options)
         images, generator = read_images(paths), torch.Generator().manual_seed(self.study.seed)
         torch.manual_seed(self.study.seed)  # dropout draws from torch's own
         truth = {"train": labels, "val": labels[:1]}
@@ -301,7 +304,7 @@ class ClassificationStudy:
 
     def _announce_hours(self, variants: Mapping[NetworkFeatures, set[str]]) -> None:
         """Attack two pictures on each network of the user, and print how long all others may take."""
-        hours, count = 0.0, 0
+        hours, count, epochs = 0.0, 0, _WHOLE_EPOCHS[self.study.quick]
         for base in dict.fromkeys(one.text or one for one in self.networks):
             shape = self._settings(base, GRADIENT_STRATEGIES[0])
             config = arm_config(self.study, self.out, f"{base.name}-timing", base.spec, **shape)
@@ -312,7 +315,7 @@ class ClassificationStudy:
                 jobs = sum(one.pending for key, one in self.arms.items() if key[1] in {x.name for x in own})
                 jobs += len(own) * 9 * (self.study.fresh or 0) if self.wants("robustness") else 0
                 whole = sum(len(names & {"code", "training"}) for net, names in variants.items() if net in own)
-                passes = jobs * _MOST_PASSES + whole * EPOCHS * len(self.whole) * GRADIENT_PASSES
+                passes = jobs * _MOST_PASSES + whole * epochs * len(self.whole) * GRADIENT_PASSES
                 hours, count = hours + passes * frame.seconds / frame.passes / 3600, count + jobs
         text = f"{count} attacks are left, for at most {hours:.2g} hours of one process at its present speed"
         Console(stderr=True).print(text, highlight=False)

@@ -263,15 +263,23 @@ def _is_retrained(results: ClassificationResults, strategy: str) -> bool:
     return strategy in GRADIENT_STRATEGIES and made
 
 
+def _class_means(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Mean of each picture's class (N,)."""
+    return (np.bincount(labels, values) / np.maximum(np.bincount(labels), 1))[labels]
+
+
 def _worth(results: ClassificationResults) -> ResultTable:
     rows: list[Row] = []
     distance = results.facts.distance
     for network in results.facts.networks:
-        far = {one: results.picture_distances(network, one, distance) for one in STRATEGIES}
-        largest = max(float(distances.max(initial=0)) for distances in far.values())
-        for strategy, weighted, kind in product((BENIGN, *STRATEGIES), (False, True), MEMBERSHIPS):
+        by_picture = {one: results.picture_distances(network, one, distance) for one in STRATEGIES}
+        by_class = {one: _class_means(values, results.labels) for one, values in by_picture.items()}
+        distances = {"no": by_picture, "picture": by_picture, "class": by_class}
+        for strategy, weighted, kind in product((BENIGN, *STRATEGIES), distances, MEMBERSHIPS):
+            far = distances[weighted]
+            largest = max(float(values.max(initial=0)) for values in far.values())
             rho = np.ones(len(results.labels)) if strategy == BENIGN else realism(far[strategy], largest)
-            setting = WorthSettings(kind, weighted)
+            setting = WorthSettings(kind, weighted != "no")
             row: Row = {"network": network.name, "strategy": strategy, "membership": kind, "weighted": weighted}
             before = results.points(network, strategy, rho)
             row |= interval_columns("worth", worth_interval(before, setting), 5)
@@ -280,11 +288,12 @@ def _worth(results: ClassificationResults) -> ResultTable:
                 row |= interval_columns("gain", information_gain(before, after, setting), 5)
             rows.append(row)
     reference = [
-        row | {"weighted": True, "worth": value} for row, value in _paper("worth", "membership", "strategy")
+        row | {"weighted": "picture", "worth": value} for row, value in _paper("worth", "membership", "strategy")
     ]
     note = (
-        f"Natural logarithm. Realism by {METRICS[distance].name}, relative to the largest distance of a network's "
-        "counterexamples. Gain: the worth under the network less that under the one retrained on such pictures."
+        f"Natural logarithm. Realism by {METRICS[distance].name}, of the picture or the mean of its class, "
+        "relative to the largest one of a network's counterexamples. Gain: the worth under the network less that under "
+        "the one retrained on such pictures."
     )
     columns = ("network", "strategy", "membership", "weighted", "worth", "gain")
     return ResultTable("worth", "Information worth", columns, rows, reference, (note, *REMARKS["worth"]))
