@@ -26,6 +26,7 @@ from drivesem.evaluation.resampling import wilson
 from drivesem.reporting.tables import Console, progress_bar, training_progress_bar
 from drivesem.run.folder import PRESENTATION, claim_folder, resolve_output_folder
 from scene_ir import files
+from scene_ir.errors import RangeError
 
 PICTURES = "pictures"
 """Folder in --out for rendered pictures, without --data."""
@@ -210,6 +211,10 @@ def _train(
             for rows in torch.randperm(count, generator=generator).split(config.batch):
                 scores, truth = batch(rows, epoch)
                 loss = F.cross_entropy(scores, truth)
+                if not bool(loss.isfinite()):
+                    raise RangeError(
+                        f"loss in epoch {epoch}", "a finite number; a lower --rate may help", float(loss)
+                    )
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 optimiser.step()

@@ -129,8 +129,9 @@ class StudyConfig(BootstrapOption, GradingOptions, SceneAttackOptions, FrameComm
     """classification: folder of photographs as backgrounds (default: generated pictures)."""
     train_pictures: Count | None = None
     """classification: training pictures, of which half become counterexamples (default: 960, with --quick 12)."""
-    whole_pictures: Count | None = None
-    """classification: training pictures for whole networks, as the code trains them (default: 240, with --quick 12)."""
+    whole_pictures: NotNegative | None = None
+    """classification: training pictures for whole networks, as the code trains them (default: 240, with --quick 0);
+    0 trains last layers instead, on all training pictures."""
     readings: str = "text,code"
     """classification: readings of the paper, with commas: text, code (configs/paper-text.yaml, paper-code.yaml)."""
     tables: str | None = None

@@ -81,6 +81,20 @@ def test_sgd_training_steps_with_momentum(monkeypatch):
     assert weights[:3] == pytest.approx([1.9, 1.71, 1.439])
 
 
+def test_a_diverging_training_is_an_error():
+    module, truth = nn.Linear(1, 1), {"train": torch.zeros(1, dtype=torch.int64)}
+    settings = ClassifyConfig(what="train", epochs=1)
+    with pytest.raises(RangeError, match=r"loss in epoch 1: expected a finite number.*--rate.*found nan"):
+        training._train(
+            module,
+            lambda *_: (module(torch.tensor([[math.nan]])), truth["train"]),
+            lambda *_: 0.0,
+            truth,
+            settings,
+            torch.Generator(),
+        )
+
+
 def test_a_unit_step_of_scw():
     """f = 3 * theta_0 + 4 * theta_1, weight 0.1, at theta (1, 2), start 0: the gradient of 0.1 f + theta^2 is
     (0.3 + 2, 0.4 + 4) = (2.3, 4.4), its norm 4.965, so a step of 0.5 goes to (1 - 0.2316, 2 - 0.4431).

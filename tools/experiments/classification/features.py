@@ -87,7 +87,7 @@ class NetworkFeatures:
 
     @property
     def takes_normalisation(self) -> bool:
-        """Whether it can be trained with another mean and deviation; SqueezeNet's weights take 0 to 255."""
+        """Whether the code's mean, deviation and rate apply to it; SqueezeNet's weights take 0 to 255."""
         network = self.network if self.text is None else self.text.network
         return network.architecture != SqueezeNet.architecture
 

@@ -123,7 +123,7 @@ class StudyNetwork:
     reading: str = "text"
     """Reading of the paper."""
     takes_normalisation: bool = True
-    """Whether the rendered set's normalisation applies to it."""
+    """Whether the code's normalisation and rate apply to it."""
 
 
 @dataclass(frozen=True, slots=True)

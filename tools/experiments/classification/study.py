@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -30,6 +30,7 @@ from drivesem.config.errors import UsageError
 from drivesem.reporting.tables import AnalysisReport, Console
 from drivesem.run.folder import ARMS, FRAMES, PRESENTATION, RETRAINED, claim_folder, resolve_output_folder
 from scene_ir import files
+from scene_ir.errors import RangeError
 from tools.experiments.classification.arms import (
     BENIGN,
     BENIGN_RETRAINED,
@@ -77,25 +78,23 @@ from tools.experiments.worth.points import PREFERRED_DISTANCES
 PICTURES = "pictures"
 """Folder of the pictures to train on."""
 EPOCHS = 20
-_WHOLE_EPOCHS = {False: EPOCHS, True: 4}
-"""Epochs of training whole networks, by default and with --quick."""
 _MOST_PASSES = 1 + 5 * (GRADIENT_PASSES + 1)
 """Passes of the network in an attack of five steps that does not stop early."""
-_TABLE_STRATEGIES = {
+_TABLE_STRATEGIES: dict[str, Collection[str]] = {
     "degradation": STRATEGIES,
     "worth": STRATEGIES,
     "realism": STRATEGIES,
     **dict.fromkeys(
         ("parameters", "hyperparameters", "retraining", "robustness", "transfer"), GRADIENT_STRATEGIES
     ),
-    "attribution": (*GRADIENT_STRATEGIES, *DIFFERENCES["sampled"][1]),
+    "attribution": (),
     "pixels": GRADIENT_STRATEGIES[:1],
     "sizes": (),
 }
 TABLES = tuple(_TABLE_STRATEGIES)
 _LONG_TABLES = ("parameters", "hyperparameters", "pixels")
 """Tables that --quick leaves out by default."""
-_SIZES = {"limit": (480, 12), "fresh": (232, 3), "train_pictures": (960, 12), "whole_pictures": (240, 12)}
+_SIZES = {"limit": (480, 12), "fresh": (232, 3), "train_pictures": (960, 12), "whole_pictures": (240, 0)}
 """Number of pictures by default and with --quick."""
 
 
@@ -113,7 +112,8 @@ _TEXT_COLUMNS = (
 _NOTE = (
     "Overall: mean over classes weighted by their sizes, which is the share of all pictures; in brackets 95 % of "
     "{draws} bootstrap draws of objects. A picture that is misclassified unchanged counts as wrong before and after, "
-    "except with networks named -code, which are trained and attacked by configs/paper-code.yaml. "
+    "except with networks named -code, which are trained and attacked by configs/paper-code.yaml (with "
+    "--whole-pictures 0 their last layer is trained). "
     "The paper's numbers are for ShapeNet's objects, photographs and another renderer: a comparison, not a target."
 )
 
@@ -155,7 +155,8 @@ class ClassificationStudy:
             raise UsageError("--readings", f"names among {', '.join(READINGS)}", repr(study.readings))
         if not tables or not set(tables) <= set(TABLES):
             raise UsageError("--tables", f"names among {', '.join(TABLES)}", repr(study.tables))
-        sizes = {name: getattr(study, name) or pair[study.quick] for name, pair in _SIZES.items()}
+        typed = {name: getattr(study, name) for name in _SIZES}
+        sizes = {name: _SIZES[name][study.quick] if size is None else size for name, size in typed.items()}
         out = resolve_output_folder(study.out, Path("runs") / f"study-classification-seed{study.seed}")
         objects = open_objects(study.objects)
         open_backgrounds(study.backgrounds)
@@ -205,7 +206,9 @@ class ClassificationStudy:
 
     def attack(self) -> None:
         """Attack the original networks. Raises UsageError or SceneError."""
-        strategies = [one for one in STRATEGIES if any(one in _TABLE_STRATEGIES[name] for name in self.tables)]
+        attributed = {one for name in DIFFERENCES for one in attributed_strategies(name, self.study.quick)}
+        needed = {**_TABLE_STRATEGIES, "attribution": attributed}
+        strategies = [one for one in STRATEGIES if any(one in needed[name] for name in self.tables)]
         for network, strategy in product(self.networks, strategies):
             settings, grade = self._settings(network, strategy), not self.study.quick
             self._add("test", network, strategy, self.test, strategy, **settings, grade=grade)
@@ -244,7 +247,8 @@ class ClassificationStudy:
 
     def _add_differences(self, network: NetworkFeatures) -> set[str]:
         """Add the arms of the table of attribution, and return the names of the networks to train for them."""
-        names = [one for one in DIFFERENCES if one != "normalisation" or network.takes_normalisation]
+        measured = {"normalisation": network.takes_normalisation, "training": self._trains_whole(network)}
+        names = [one for one in DIFFERENCES if measured.get(one, True)]
         for difference in (*names, CONTROL):
             settings = {} if difference == CONTROL else code_settings(difference)
             trained = difference in (*TRAINED, CONTROL)
@@ -255,12 +259,15 @@ class ClassificationStudy:
                 self._add(f"with {difference}", network, strategy, self.test, name, **attack, network=spec)
         return {CONTROL, *names} & {CONTROL, *TRAINED}
 
+    def _trains_whole(self, network: NetworkFeatures) -> bool:
+        return bool(self.study.whole_pictures) and network.takes_normalisation
+
     def _variant_path(self, network: NetworkFeatures, name: str) -> str:
         return network.spec if name == "code" else str(self._weights(network, f"with-{name}"))
 
     @cached_property
     def whole(self) -> tuple[ObjectView, ...]:
-        """Training pictures for whole networks; classes keep their shares."""
+        """Training pictures for networks of the code, or all; classes keep their shares."""
         rng = np.random.default_rng(self.study.seed)
         size = self.study.whole_pictures or len(self.train)
         return tuple(self.train[place] for place in sample_stratified(self.labels(self.train), size, rng))
@@ -285,15 +292,18 @@ class ClassificationStudy:
         learner = copy.deepcopy(network.network).requires_grad_(True)
         if settings.get("normalisation") == "rendered" and network.takes_normalisation:
             learner.normalise_by(RENDERED_MEAN, RENDERED_STD)
-        options = {one: settings[one] for one in DIFFERENCES["training"][0] if one in settings}
-        options["epochs"] = _WHOLE_EPOCHS[self.study.quick] if options.get("layers") == "all" else EPOCHS
-        config = ClassifyConfig(what="train", device=self.study.device, **options)
+        trained = DIFFERENCES["training"][0] if self._trains_whole(network) else ()
+        options = {one: settings[one] for one in trained if one in settings}
+        config = ClassifyConfig(what="train", device=self.study.device, **{"epochs": EPOCHS, **options})
         images, generator = read_images(paths), torch.Generator().manual_seed(self.study.seed)
         torch.manual_seed(self.study.seed)  # dropout draws from torch's own
         truth = {"train": labels, "val": labels[:1]}
         if config.layers == "all":
             pictures, checkpoint = {"train": images, "val": images[:1]}, path.with_suffix(".checkpoint")
-            train_all_layers(learner, pictures, truth, config, generator, checkpoint)
+            try:
+                train_all_layers(learner, pictures, truth, config, generator, checkpoint)
+            except RangeError as error:
+                raise UsageError("--whole-pictures", f"0, since {network.name} diverges", error) from error
             checkpoint.unlink()
         else:
             learner.eval()
@@ -304,7 +314,7 @@ class ClassificationStudy:
 
     def _announce_hours(self, variants: Mapping[NetworkFeatures, set[str]]) -> None:
         """Attack two pictures on each network of the user, and print how long all others may take."""
-        hours, count, epochs = 0.0, 0, _WHOLE_EPOCHS[self.study.quick]
+        hours, count = 0.0, 0
         for base in dict.fromkeys(one.text or one for one in self.networks):
             shape = self._settings(base, GRADIENT_STRATEGIES[0])
             config = arm_config(self.study, self.out, f"{base.name}-timing", base.spec, **shape)
@@ -315,7 +325,7 @@ class ClassificationStudy:
                 jobs = sum(one.pending for key, one in self.arms.items() if key[1] in {x.name for x in own})
                 jobs += len(own) * 9 * (self.study.fresh or 0) if self.wants("robustness") else 0
                 whole = sum(len(names & {"code", "training"}) for net, names in variants.items() if net in own)
-                passes = jobs * _MOST_PASSES + whole * epochs * len(self.whole) * GRADIENT_PASSES
+                passes = jobs * _MOST_PASSES + whole * EPOCHS * (self.study.whole_pictures or 0) * GRADIENT_PASSES
                 hours, count = hours + passes * frame.seconds / frame.passes / 3600, count + jobs
         text = f"{count} attacks are left, for at most {hours:.2g} hours of one process at its present speed"
         Console(stderr=True).print(text, highlight=False)

@@ -360,8 +360,13 @@ def _pixels(results: ClassificationResults) -> ResultTable:
 
 def _attribution(results: ClassificationResults) -> ResultTable:
     rows = []
+    whole = results.facts.settings.whole_pictures != 0
     for network, difference in product(results.facts.networks, DIFFERENCES):
-        if network.reading != "text" or (difference == "normalisation" and not network.takes_normalisation):
+        measured = {
+            "normalisation": network.takes_normalisation,
+            "training": network.takes_normalisation and whole,
+        }
+        if network.reading != "text" or not measured.get(difference, True):
             continue
         for strategy in attributed_strategies(difference, results.facts.settings.quick):
             arms = (f"with {CONTROL}" if difference in TRAINED else "test", f"with {difference}")
