@@ -213,7 +213,7 @@ def _train(
                 loss = F.cross_entropy(scores, truth)
                 if not bool(loss.isfinite()):
                     raise RangeError(
-                        f"loss in epoch {epoch}", "a finite number; a lower --rate may help", float(loss)
+                        f"loss in epoch {epoch}", "a finite number; a lower --rate may help", float(loss.detach())
                     )
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()

@@ -94,7 +94,7 @@ def test_the_effect_of_a_difference_by_hand(results: ClassificationResults) -> N
     assert row["effect_low"] <= -0.4 <= row["effect_high"]
     normalised = [r["network"] for r in rows if r["difference"] == "normalisation"]
     assert normalised == ["one"]  # --quick: one strategy each
-    assert len(rows) == 2 * 7 + 1
+    assert len(rows) == 8 + 6
 
 
 @pytest.mark.parametrize(
