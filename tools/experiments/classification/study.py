@@ -490,7 +490,7 @@ class ClassificationStudy:
                 "test": len(self.usable),
                 "train": len(self.train),
                 "retrained": len(self.retested),
-                "whole": len(self.whole),
+                "whole": self.study.whole_pictures or 0,
             },
             objects={split: count_by_class(list(self.objects.names(split))) for split in SPLITS},
             used={
