@@ -360,12 +360,11 @@ def _pixels(results: ClassificationResults) -> ResultTable:
 
 def _attribution(results: ClassificationResults) -> ResultTable:
     rows = []
-    whole = results.facts.settings.whole_pictures != 0
+    counts = results.facts.counts
+    whole = counts.get("whole", 0)
     for network, difference in product(results.facts.networks, DIFFERENCES):
-        measured = {
-            "normalisation": network.takes_normalisation,
-            "training": network.takes_normalisation and whole,
-        }
+        measured = {"normalisation": network.takes_normalisation}
+        measured["training"] = network.takes_normalisation and whole > 0
         if network.reading != "text" or not measured.get(difference, True):
             continue
         for strategy in attributed_strategies(difference, results.facts.settings.quick):
@@ -378,8 +377,8 @@ def _attribution(results: ClassificationResults) -> ResultTable:
             rows.append(row | interval_columns("effect", before.accuracy_drop(after, results.bootstrap), 5))
     note = (
         "Accuracy after the attack with one setting of the paper's code, and its paired difference from the text's. "
-        f"Networks for {', '.join(TRAINED)} are trained on {results.facts.counts.get('whole', 0)} pictures, and so is "
-        "the network without the difference: its last layer. Retrained networks of all tables have a new last layer."
+        f"Networks for {', '.join(TRAINED)} are trained further on {whole or counts['train']} pictures, and so is the "
+        "last layer of the network without the difference."
     )
     columns = ("network", "difference", "strategy", "pictures", "as_text", "as_code", "effect")
     title = "What each difference between the paper's text and code changes, points of accuracy"
