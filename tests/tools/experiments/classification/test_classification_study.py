@@ -184,7 +184,16 @@ def test_all_tables(two_networks, tmp_path, capsys, monkeypatch):
 def test_both_readings(two_networks, tmp_path, capsys, monkeypatch):
     out, one = tmp_path / "out", two_networks.partition(",")[0]
     sizes = ("--limit", "3", "--fresh", "1", "--train-pictures", "3", "--whole-pictures", "3")
-    words = ("--networks", one, "--out", str(out), *sizes, "--tables", "retraining,robustness", "--json")
+    words = (
+        "--networks",
+        one,
+        "--out",
+        str(out),
+        *sizes,
+        "--tables",
+        "degradation,retraining,robustness",
+        "--json",
+    )
     save = study_module.save_classifier
 
     def interrupt(*arguments):
@@ -195,6 +204,8 @@ def test_both_readings(two_networks, tmp_path, capsys, monkeypatch):
     assert study(capsys, *words)[0] != 0
     code, data, _ = study(capsys, *words)
     assert code == 0
+    rows = data["tables"]["degradation"]["rows"]
+    assert [row["network"] for row in rows[::8]] == ["one", "one-code"]
     for table in ("retraining", "robustness"):
         assert {row["network"] for row in data["tables"][table]["rows"]} == {"one", "one-code"}
     # The code's network has seen the coloured lamp and has its normalisation, and its attacks its settings.
