@@ -122,7 +122,8 @@ def study_settings(study: StudyConfig) -> dict[str, Any]:
 
 def study_command(study: StudyConfig) -> str:
     """The command that repeats a study."""
-    return format_command_line("study", study, (*UNRECORDED, "name")).replace("study", f"study {study.name}", 1)
+    line = format_command_line("study", study, (*UNRECORDED, "name"))
+    return line.replace("drivesem study", f"python -m tools.experiments {study.name}", 1)
 
 
 def read_metadata(folder: Path, kind: type[T], name: str) -> T:
