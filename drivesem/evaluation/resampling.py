@@ -220,7 +220,7 @@ def paired_differences(
             found.append(PairedDifference(a.name, va, vb, None, None, None, None))
             continue
         low, high = _bounds([_minus(b.value(w), a.value(w)) for w in weights])
-        joined = a.concatenate(b)
+        joined = a.concatenate(b) if test else a
         extreme = 0
         for swap in swaps.astype(np.float64):
             swapped = _minus(

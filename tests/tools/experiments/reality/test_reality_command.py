@@ -28,6 +28,7 @@ from tools.experiments.reality.retraining import (
     ARMS,
     DETECTIONS,
     OBJECTS,
+    START,
     ArmDetection,
     RetrainTestFrame,
     read_matches,
@@ -52,8 +53,9 @@ def write_results(folder: Path) -> None:
     frames = [RetrainTestFrame(condition, f"{condition}{i}", 2) for condition in (DAY, *ADVERSE) for i in range(4)]
     write_table(folder / OBJECTS.format("a"), (RetrainTestFrame,), [(frame,) for frame in frames])
     found = [
-        ArmDetection(arm, 0, frame.frame, round(0.9 - 0.01 * k, 2), k <= number)
-        for number, arm in enumerate(ARMS)
+        ArmDetection(arm, seed, frame.frame, round(0.9 - 0.01 * k, 2), k <= number)
+        for number, arm in enumerate((*ARMS, START))
+        for seed in range(1 if arm == START else 2)
         for frame in frames
         for k in range(2)
     ]
@@ -74,6 +76,12 @@ def test_report_of_stored_tables(tmp_path: Path, output_json: Callable[..., dict
     text = (tmp_path / "out" / "study.md").read_text(encoding="utf-8")
     for title in ("Losses of recall", "Rules found on dry days", "How many rules hold", "AP50 of cars"):
         assert title in text
+    days, start = (data["retrained"][0]["arms"][arm]["fog"] for arm in ("days", START))
+    assert (days[0], start[0]) == (pytest.approx(0.5, abs=0.01), pytest.approx(1.0))  # of two cars a frame, one or both
+    assert data["retrained"][0]["differences"][START]["fog"] == [0, 0, 0]
+    recall = data["retrained"][1]
+    assert recall["metric"] == "recall at a precision of 80%"
+    assert recall["arms"]["usual"]["night"][0] == 1
     for name in ("losses", "lifts", "retraining"):
         assert (tmp_path / "out" / f"{name}.png").stat().st_size > 10_000
 
@@ -84,7 +92,7 @@ def test_tables_are_read_back(tmp_path: Path) -> None:
     assert {one.condition for one, _ in rows} == {DAY, UNDRAWN, *ADVERSE}
     matches, frames = read_matches(tmp_path, "a")
     assert len(frames) == 24
-    assert {arm for arm, _ in matches} == set(ARMS)
+    assert {arm for arm, _ in matches} == {*ARMS, START}
     assert [int(matches[arm, 0].true_positives.sum()) for arm in ARMS] == [24, 48, 48, 48]
     assert matches["days", 0].objects.sum() == 48
 
