@@ -241,9 +241,9 @@ def _run_in_pool(
                 lost += pending.values()
                 return
     finally:
-        # do not wait for running jobs: their output is complete or absent; idle processes end by themselves, since
-        # a killed one leaks the semaphores of its libraries
-        pool.shutdown(kill_workers=bool(pending))
+        # do not wait for running jobs: their output is complete or absent; idle processes end by themselves in the
+        # meantime, since a killed one leaks the semaphores of its libraries
+        pool.shutdown(wait=bool(pending), kill_workers=bool(pending))
 
 
 @contextmanager

@@ -24,7 +24,6 @@ from drivesem.config.options import WorkerOptions
 from drivesem.run.allocation import release_freed_memory
 from drivesem.run.workers import run_jobs
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
-from tools.hostile.trial import wait_until
 
 
 def square(job: int, offset: int = 0) -> tuple[int, int]:
@@ -220,6 +219,12 @@ from tests.drivesem.run.test_workers import {build}
 signal.signal(signal.SIGINT, signal.default_int_handler)
 list(run_jobs(None, partial({build}, {folder!r}), [1, 2], WorkerOptions(workers=2)))
 """
+
+
+def wait_until(condition: Callable[[], bool], seconds: float) -> bool:
+    from tools.hostile import trial  # slow, and workers import this module
+
+    return trial.wait_until(condition, seconds)
 
 
 def parent_of_workers(folder: Path, build: str = "lingering") -> subprocess.Popen[str]:
