@@ -77,7 +77,10 @@ def test_report_of_stored_tables(tmp_path: Path, output_json: Callable[..., dict
     for title in ("Losses of recall", "Rules found on dry days", "How many rules hold", "AP50 of cars"):
         assert title in text
     days, start = (data["retrained"][0]["arms"][arm]["fog"] for arm in ("days", START))
-    assert (days[0], start[0]) == (pytest.approx(0.5, abs=0.01), pytest.approx(1.0))  # of two cars a frame, one or both
+    assert (days[0], start[0]) == (
+        pytest.approx(0.5, abs=0.01),
+        pytest.approx(1.0),
+    )  # of two cars a frame, one or both
     assert data["retrained"][0]["differences"][START]["fog"] == [0, 0, 0]
     recall = data["retrained"][1]
     assert recall["metric"] == "recall at a precision of 80%"
