@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from detectors.registry import load_detector
+from drivesem.evaluation.curves import ClassMatches
 from scene_ir import files
 from tests.tools.experiments.reality.test_losses import observe
 from tools.bench.conditions import DAY, UNDRAWN
@@ -24,6 +26,7 @@ from tools.experiments.reality.observations import (
     ObservedObject,
     read_observations,
 )
+from tools.experiments.reality.report import RecallAtPrecision
 from tools.experiments.reality.retraining import (
     ARMS,
     DETECTIONS,
@@ -31,6 +34,7 @@ from tools.experiments.reality.retraining import (
     START,
     ArmDetection,
     RetrainTestFrame,
+    find_worst,
     read_matches,
 )
 from tools.experiments.tables import METADATA, write_table
@@ -98,6 +102,18 @@ def test_tables_are_read_back(tmp_path: Path) -> None:
     assert {arm for arm, _ in matches} == {*ARMS, START}
     assert [int(matches[arm, 0].true_positives.sum()) for arm in ARMS] == [24, 48, 48, 48]
     assert matches["days", 0].objects.sum() == 48
+
+
+def test_recall_at_a_precision_is_the_largest_where_enough_detections_are_right() -> None:
+    hits = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0])  # precision 1, 1, 0.67, 0.75, 0.8, 0.67, 0.57, 0.63
+    matches = ClassMatches(np.linspace(0.9, 0.1, 8), np.zeros(8, np.int64), hits, 1 - hits, np.array([10.0]))
+    assert RecallAtPrecision(matches, "coco").value(None) == pytest.approx(0.4)
+
+
+def test_the_worst_state_has_the_largest_loss(tmp_path: Path) -> None:
+    files.write_json(tmp_path / "losses.json", {"a": [1.0, 3.0, 2.0], "b": [5.0, 4.0], "empty": []})
+    days = [tmp_path / name for name in ("a", "b", "empty")]
+    assert find_worst(days, load_detector("squeezedet"), tmp_path / "losses.json") == [1, 0, 0]
 
 
 def test_half_b_stays_closed_until_rules_are_fixed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

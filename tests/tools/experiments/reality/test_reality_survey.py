@@ -14,7 +14,7 @@ from tests.drivesem.commands.conftest import write_finished_run
 from tests.tools.bench.test_bench_conditions import names_of
 from tools.experiments.__main__ import main
 from tools.experiments.reality.features import ObjectFeatures
-from tools.experiments.reality.observations import REAL, TABLE, ObservedObject
+from tools.experiments.reality.observations import DRAWN, REAL, TABLE, ObservedObject
 from tools.experiments.tables import RESULTS, write_table
 
 BOX = (60.0, 40.0, 40.0, 30.0)
@@ -41,7 +41,7 @@ def write_dusk(root: Path, names: list[str]) -> None:
     )
 
 
-def test_certain_failures_and_real_misses_are_asked_about(tmp_path: Path) -> None:
+def test_the_survey_has_certain_failures_and_real_misses(tmp_path: Path) -> None:
     names = names_of("B", "dawn", 2)
     write_dusk(tmp_path / "data", names)
     run = write_finished_run(tmp_path / "out" / "attacks" / "squeezedet-bdd")
@@ -56,6 +56,8 @@ def test_certain_failures_and_real_misses_are_asked_about(tmp_path: Path) -> Non
         for name in names
         for k, missed in enumerate((name == names[0], False))
     ]
+    drawn = ObservedObject("B", "dusk", DRAWN, names[1], 1, False, "squeezedet")
+    rows.append((drawn, features))  # missed, but in a drawn picture
     write_table(tmp_path / "out" / RESULTS / TABLE.format("B"), (ObservedObject, ObjectFeatures), rows)
     assert main(["reality", "survey", "--root", str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 0
     key = json.loads((tmp_path / "out" / "survey" / "survey-key.json").read_text())
