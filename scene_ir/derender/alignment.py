@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from scipy.spatial import ConvexHull, KDTree
 from torch import Tensor
 
 from scene_ir.derender.silhouette import LabelBoxes, Mask, Placement, measure_edge_distances, render_silhouettes
-from scene_ir.meshes.lod import level_of_detail
+from scene_ir.meshes.lod import SameMesh, level_of_detail
 from scene_ir.raster import verbs
 from scene_ir.types import Camera, Mesh
 
@@ -80,10 +81,8 @@ def align_to_boxes(
     """
     settings = settings or BoxAlignmentSettings()
     aligned = []
-    shapes: dict[int, _MeshShape] = {}
     for placement, box, trust in zip(placements, boxes.xyxy, boxes.trust, strict=True):
-        shape = shapes.get(id(placement.mesh)) or _MeshShape.from_mesh(placement.mesh)
-        shapes[id(placement.mesh)] = shape
+        shape = _mesh_shape(SameMesh(placement.mesh))
         code = _solve_pose(placement, shape, (box.double().numpy(), trust.double().numpy()), camera, settings)
         aligned.append(placement.adjusted(torch.from_numpy(code * settings.label_sigmas())))
     return aligned
@@ -100,12 +99,14 @@ class _MeshShape:
     hull: Array
     """(K, 3) vertices of the full mesh's convex hull, a tenth of them: enough for a car inside the image."""
 
-    @classmethod
-    def from_mesh(cls, mesh: Mesh) -> _MeshShape:
-        vertices, light = mesh.vertices.double().numpy(), level_of_detail(mesh, _DETAIL_PX)
-        faces = light.faces.numpy()
-        edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-        return cls(light.vertices.double().numpy(), edges, vertices[ConvexHull(vertices).vertices])
+
+@lru_cache(maxsize=64)
+def _mesh_shape(key: SameMesh) -> _MeshShape:
+    mesh = key.mesh
+    vertices, light = mesh.vertices.double().numpy(), level_of_detail(mesh, _DETAIL_PX)
+    faces = light.faces.numpy()
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    return _MeshShape(light.vertices.double().numpy(), edges, vertices[ConvexHull(vertices).vertices])
 
 
 def _solve_pose(
@@ -123,32 +124,38 @@ def _solve_pose(
     sigmas = settings.label_sigmas()
     sigma = settings.side_px + settings.side_share * (box[3] - box[1])
 
-    def residual(code: Array) -> Array:
-        change = code * sigmas
-        cos, sin = np.cos(yaw + change[3]), np.sin(yaw + change[3])
+    def residuals(codes: Array) -> Array:
+        """Of K codes (K, 7): (K, 4)."""
+        change = codes * sigmas
+        cos, sin = np.cos(yaw + change[:, 3:4]), np.sin(yaw + change[:, 3:4])
 
         def project(points: Array) -> Array:
-            local = points * (size * np.exp(change[4:]))
-            x = cos * local[:, 0] + sin * local[:, 2] + place[0] + change[0]
-            z = cos * local[:, 2] - sin * local[:, 0] + place[2] + change[2]
-            return matrix @ np.stack([x, local[:, 1] + place[1] + change[1], z, np.ones_like(x)])
+            """Points (V, 3) to (K, 3, V)."""
+            stretch = size * np.exp(change[:, 4:])
+            local = [points[:, axis] * stretch[:, axis : axis + 1] for axis in range(3)]
+            x = cos * local[0] + sin * local[2] + place[0] + change[:, :1]
+            z = cos * local[2] - sin * local[0] + place[2] + change[:, 2:3]
+            y = local[1] + place[1] + change[:, 1:2]
+            return matrix[:, :3] @ np.stack([x, y, z], 1) + matrix[:, 3:]
 
         hull = project(shape.hull)
-        if (_frustum_distances(hull, camera) >= 0).all():
-            extent = _pixel_bounds(hull)
-        else:
-            extent = _clipped_bounds(project(shape.vertices), shape.edges, camera, box)
-        return trust * (extent - box) / sigma
+        inside = (_frustum_distances(hull, camera) >= 0).all((1, 2))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            extents = _pixel_bounds(hull)
+        if not inside.all():
+            whole = project(shape.vertices)
+            for k in np.flatnonzero(~inside):
+                extents[k] = _clipped_bounds(whole[k], shape.edges, camera, box)
+        return trust * (extents - box) / sigma
 
     code = np.zeros(7)
-    r = residual(code)
     for _ in range(_STEPS):
-        slopes = np.stack([(residual(code + _DELTA * e) - r) / _DELTA for e in np.eye(7)], 1)
+        r, *moved = residuals(code + _DELTA * np.eye(8, 7, -1))
+        slopes = (np.stack(moved, 1) - r[:, None]) / _DELTA
         weight = np.minimum(1.0, settings.robust / np.maximum(np.abs(r), 1e-9))
         normal = slopes.T @ (weight[:, None] * slopes) + np.eye(7)
         step = -np.linalg.solve(normal, slopes.T @ (weight * r) + code)
         code = np.clip(code + step, -settings.reach, settings.reach)
-        r = residual(code)
     return code
 
 
@@ -177,15 +184,18 @@ def _clipped_bounds(clip: Array, edges: NDArray[np.int64], camera: Camera, defau
 
 
 def _frustum_distances(clip: Array, camera: Camera) -> Array:
-    """Distances (5, V) of points inside the near plane and the image's four sides; negative outside."""
+    """Distances (..., 5, V) of points (..., 3, V) inside the near plane and the image's four sides; negative
+    outside.
+    """
     right, low = camera.width - 1.0, camera.height - 1.0
-    u, v, w = clip
-    return np.stack([w - _NEAR_M, u, right * w - u, v, low * w - v])
+    u, v, w = np.moveaxis(clip, -2, 0)
+    return np.stack([w - _NEAR_M, u, right * w - u, v, low * w - v], -2)
 
 
 def _pixel_bounds(clip: Array) -> Array:
-    pixels = clip[:2] / clip[2]
-    return np.concatenate([pixels.min(1), pixels.max(1)])
+    """Box xyxy (..., 4) px of points (..., 3, V)."""
+    pixels = clip[..., :2, :] / clip[..., 2:, :]
+    return np.concatenate([pixels.min(-1), pixels.max(-1)], -1)
 
 
 _TRIED_TURNS_RAD = (-0.1, -0.05, 0.05, 0.1)

@@ -32,8 +32,6 @@ _MIN_REST = 0.05
 """A smaller share of all but vehicles carries no information."""
 _BORDER_PX = 5
 """Pixels this near to vehicles and shadows are not copied: their colours are mixed, and masks have errors."""
-_LARGE_HOLE_PX = 60_000
-"""Larger holes are not searched at full size, which saves a third of the time with little visible loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +84,34 @@ def _scale_mask(mask: Mask, shrink: int) -> Mask:
     return mask if shrink == 1 else _scale_down(mask.astype(np.float32), shrink) > 0
 
 
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A photograph at one over `shrink` of its size."""
+
+    image: Array
+    """(H, W, 3) in [0, 1]."""
+    near: Array
+    """(H, W) m, distance of the ground from the vehicles' footprints."""
+    inputs: BackgroundInputs
+    """What is known about the photograph at this size."""
+    shrink: int
+    """See above."""
+
+    def scaled_down(self, shrink: int) -> _View:
+        """The photograph, which is at its full size, at one over `shrink` of it."""
+        if shrink == 1:
+            return self
+        nearest = cv2.resize(self.near, _scaled_size(self.near.shape, shrink), interpolation=cv2.INTER_NEAREST)
+        inputs = self.inputs.scaled_down(shrink)
+        return _View(_scale_down(self.image, shrink), np.asarray(nearest, np.float32), inputs, shrink)
+
+    def enlarge(self, filled: Array, unknown: Mask) -> Array:
+        """This photograph (H, W, 3) with unknown pixels (H, W) from a smaller image of it."""
+        size = self.image.shape[1], self.image.shape[0]
+        enlarged = np.clip(cv2.resize(filled, size, interpolation=cv2.INTER_CUBIC), 0, 1)
+        return np.where(unknown[..., None], enlarged, self.image).astype(np.float32)
+
+
 class BackgroundFill:
     """Fills pixels of one photograph with the background behind them."""
 
@@ -96,71 +122,74 @@ class BackgroundFill:
             image: (H, W, 3) in [0, 1].
             near: Distance (H, W) m of the ground from the vehicles' footprints.
             inputs: What is known about the photograph.
-            shrink: Work at one over this size: faster, with less detail.
+            shrink: Fill at one over this size: faster, with less detail.
         """
-        self._full = image
-        self._shrink = shrink
-        self._image, self._near, self._inputs = image, near, inputs
-        if shrink > 1:
-            self._image, self._inputs = _scale_down(image, shrink), inputs.scaled_down(shrink)
-            nearest = cv2.resize(near, _scaled_size(near.shape, shrink), interpolation=cv2.INTER_NEAREST)
-            self._near = np.asarray(nearest, np.float32)
-        self._coordinates = street.ground_coordinates(self._inputs.ground, self._inputs.camera)
+        self._full = _View(image, near, inputs, 1)
+        self._work = self._full.scaled_down(shrink)
+        # The continued street is smooth: half the size shows it.
+        self._coarse = self._full.scaled_down(2 * shrink)
+        self._coordinates = street.ground_coordinates(self._coarse.inputs.ground, self._coarse.inputs.camera)
 
     def continue_street(self, unknown: Mask) -> Array:
         """The image (H, W, 3) with a smooth continuation of the street at unknown pixels (H, W)."""
-        return self._at_full_size(self._continue_street(_scale_mask(unknown, self._shrink)).image, unknown)
+        return self._full.enlarge(self._continue_street(unknown, self._coarse.shrink).image, unknown)
 
     def fill_hole(self, hole: Mask, seed: int) -> Array:
         """The image (H, W, 3) with the hole (H, W) filled; `seed` is the random search's."""
-        return self._at_full_size(self._fill_hole(_scale_mask(hole, self._shrink), seed), hole)
-
-    def _at_full_size(self, filled: Array, hole: Mask) -> Array:
-        if self._shrink == 1:
-            return filled
-        size = self._full.shape[1], self._full.shape[0]
-        enlarged = np.clip(cv2.resize(filled, size, interpolation=cv2.INTER_CUBIC), 0, 1)
-        return np.where(hole[..., None], enlarged, self._full).astype(np.float32)
+        filled = self._fill_hole(_scale_mask(hole, self._work.shrink), seed)
+        return filled if self._work is self._full else self._full.enlarge(filled, hole)
 
     def _fill_hole(self, hole: Mask, seed: int) -> Array:
-        shrink, maps, horizon = self._shrink, self._inputs.maps, self._inputs.horizon
-        guide = self._continue_street(grow_mask(hole, 2 / shrink))
-        forbidden = grow_mask(hole, _BORDER_PX / shrink) | self._excluded_pixels(hole)
+        work, shrink = self._work, self._work.shrink
+        maps, horizon = work.inputs.maps, work.inputs.horizon
+        guide = self._guide(grow_mask(hole, 2 / shrink))
+        forbidden = grow_mask(hole, _BORDER_PX / shrink) | _excluded_pixels(work, hole)
         share = np.where(forbidden, 0, np.where(guide.ground, _ground_share(maps), maps.ground)).astype(np.float32)
         column_settings = ColumnCopySettings().scaled_down(shrink)
-        columns = copy_columns(self._image, hole, forbidden | (share > 0.5), guide, horizon, column_settings)
+        columns = copy_columns(work.image, hole, forbidden | (share > 0.5), guide, horizon, column_settings)
         rest, forbidden = hole & ~columns.copied, forbidden & ~columns.copied
-        ground = patch_fill.GroundMaps((self._near < _STOOD_M) | guide.ground, share)
-        settings = patch_fill.PatchFillSettings()
-        if np.count_nonzero(rest) > _LARGE_HOLE_PX:
-            settings = replace(settings, iterations=(8, 0))
-        settings = settings.scaled_down(shrink)
+        ground = patch_fill.GroundMaps((work.near < _STOOD_M) | guide.ground, share)
+        settings = patch_fill.PatchFillSettings().scaled_down(shrink)
         return patch_fill.fill_patches(
             columns.image, rest, forbidden, horizon, ground, seed, settings, guide.image
         )
 
-    def _continue_street(self, unknown: Mask) -> street.StreetContinuation:
-        maps = self._inputs.maps
-        unknown = unknown | self._excluded_pixels(unknown)
-        shares = street.StreetShares(maps.ground, maps.sky, unknown & (self._near < _STOOD_M), _ground_share(maps))
+    def _guide(self, unknown: Mask) -> street.StreetContinuation:
+        """The street continued into unknown pixels (H, W) of the size that is filled."""
+        found = self._continue_street(unknown, 2)
+        height, width = unknown.shape
+        ground = cv2.resize(found.ground.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        foot = 2 * np.interp(np.arange(width) / 2 - 0.25, np.arange(found.foot.size), found.foot) + 0.5
+        return replace(found, image=self._work.enlarge(found.image, unknown), ground=ground, foot=foot)
+
+    def _continue_street(self, unknown: Mask, factor: int) -> street.StreetContinuation:
+        """The street at the coarse size; `unknown` is `factor` times as large."""
+        coarse = self._coarse
+        unknown = _scale_mask(unknown, factor)
+        unknown = unknown | _excluded_pixels(coarse, unknown)
+        maps = coarse.inputs.maps
+        shares = street.StreetShares(
+            maps.ground, maps.sky, unknown & (coarse.near < _STOOD_M), _ground_share(maps)
+        )
         return street.continue_street(
-            self._image, unknown, shares, self._coordinates, self._inputs.horizon, self._shrink
+            coarse.image, unknown, shares, self._coordinates, coarse.inputs.horizon, coarse.shrink
         )
 
-    def _excluded_pixels(self, unknown: Mask) -> Mask:
-        """Pixels (H, W), outside the unknown ones, of people and vehicles, labelled or not."""
-        maps = self._inputs.maps
-        # Light walls and cobbles look somewhat like cars: only a large core with high shares is one.
-        core_pixels = ((maps.vehicle > _VEHICLE_SHARE) & ~unknown).astype(np.uint8)
-        count, components, stats, _ = cv2.connectedComponentsWithStats(core_pixels)
-        min_area = _MIN_CORE_PX / self._shrink**2
-        large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= min_area]
-        vehicle = np.isin(components, large)
-        if large:
-            rest = (maps.vehicle > 0.5) & (_ground_share(maps) < 0.5)
-            vehicle = vehicle | (grow_mask(vehicle, _AROUND_CORE_PX / self._shrink) & rest)
-        near_vehicle = grow_mask(vehicle, _BORDER_PX / self._shrink)
-        return self._inputs.excluded | near_vehicle | (maps.person > _PERSON_SHARE)
+
+def _excluded_pixels(view: _View, unknown: Mask) -> Mask:
+    """Pixels (H, W), outside the unknown ones, of people and vehicles, labelled or not."""
+    maps = view.inputs.maps
+    # Light walls and cobbles look somewhat like cars: only a large core with high shares is one.
+    core_pixels = ((maps.vehicle > _VEHICLE_SHARE) & ~unknown).astype(np.uint8)
+    count, components, stats, _ = cv2.connectedComponentsWithStats(core_pixels)
+    min_area = _MIN_CORE_PX / view.shrink**2
+    large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= min_area]
+    vehicle = np.isin(components, large)
+    if large:
+        rest = (maps.vehicle > 0.5) & (_ground_share(maps) < 0.5)
+        vehicle = vehicle | (grow_mask(vehicle, _AROUND_CORE_PX / view.shrink) & rest)
+    near_vehicle = grow_mask(vehicle, _BORDER_PX / view.shrink)
+    return view.inputs.excluded | near_vehicle | (maps.person > _PERSON_SHARE)
 
 
 def _ground_share(maps: Segmentation) -> Array:

@@ -305,7 +305,7 @@ def cut_out(
     cameras = [crop_camera(camera, rect) for _, rect in in_view]
     given = np.zeros((len(in_view), 2, *CROP_HW), np.float32)
     for row, (i, rect) in enumerate(in_view):
-        others = np.repeat(nearer[i][..., None].astype(np.uint8) * 255, 3, axis=2)
+        others = nearer[i][..., None].astype(np.uint8) * 255
         given[row, 1] = inside_mask(rect, (0, 0, camera.width, camera.height))
         given[row, 0] = crop_boxes(others, rects[row : row + 1], CROP_HW, 1.0)[0, ..., 0] / 255 * given[row, 1]
     crops = torch.from_numpy(crop_boxes(image, rects, CROP_HW, 1.0).transpose(0, 3, 1, 2).astype(np.float32) / 255)

@@ -213,7 +213,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     solved = solve_sources(
         scene,
         [_crop_nonzero(matte[None]) for matte in mattes],
-        [_crop_nonzero(1 - factor.transpose(2, 0, 1), inverted=True) for factor in shadows],
+        shadows,
         SolveSettings(backend=settings.backend),
         [_matte_reach_px(cut, opacity, settings) for cut, opacity in zip(cuts, mattes, strict=True)],
     )
@@ -597,9 +597,10 @@ def _remove_occluders(
 def _remove_underbody(cut: _VehicleCutout, view: shadow.GroundView) -> _VehicleCutout:
     """The mask without the dark ground between and next to the wheels, which is shadow on the ground."""
     _, top, _, bottom = silhouette.mask_bounds(cut.outline)
-    low = np.arange(cut.outline.shape[0])[:, None] > bottom - _UNDERBODY * (bottom - top)
-    beneath = low & (view.distance < 0.4) & ~grow_mask(cut.outline, 1.5)
-    return replace(cut, mask=cut.mask & ~beneath) if (cut.mask & ~beneath).any() else cut
+    low = np.arange(cut.outline.shape[0])[view.window[0], None] > bottom - _UNDERBODY * (bottom - top)
+    beneath = low & (view.distance < 0.4) & ~grow_mask(cut.outline, 1.5)[view.window]
+    mask = cut.mask & ~view.in_frame(beneath, cut.mask.shape)
+    return replace(cut, mask=mask) if mask.any() else cut
 
 
 def _separate_layers(
@@ -609,28 +610,29 @@ def _separate_layers(
     vehicles: Mask,
     inputs: BackgroundInputs,
     settings: DerenderSettings,
-) -> tuple[Array, list[Array], list[Array], torch.Tensor]:
-    """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W), shadow factors (H, W, 3), sun (3,)."""
+) -> tuple[Array, list[Array], list[Crop], torch.Tensor]:
+    """Background (H, W, 3) on the photograph's 8-bit grid, mattes (H, W), shadow factors (3, h, w), sun (3,)."""
     if not cuts:
         return image, [], [], ground_geometry.default_sun()
-    distance = np.stack([view.distance for view in views])
-    near = distance.min(0)
+    owner, near = shadow.nearest_views(views, image.shape)
     in_front = inputs.occluder_opacity > 0
-    fill = light_fill = BackgroundFill(image, near, inputs, settings.shrink)
-    if settings.shrink > 1:  # light is smooth
-        light_fill = BackgroundFill(image, near, inputs, 2 * settings.shrink)
-    lighting = shadow.estimate_ground_light(image, vehicles, views, light_fill.continue_street)
+    fill = BackgroundFill(image, near, inputs, settings.shrink)
+    lighting = shadow.estimate_ground_light(image, vehicles, views, fill.continue_street)
     sun, shaded = _find_shadows(lighting, cuts, views, vehicles, in_front)
     hole = vehicles.copy()
     for cut, region, view in zip(cuts, shaded, views, strict=True):
-        hole |= grow_mask(region, 2.5) | grow_mask(cut.mask, 4) | (view.distance < 0.2)
+        hole |= grow_mask(view.in_frame(region, hole.shape), 2.5) | grow_mask(cut.mask, 4)
+        hole[view.window] |= view.distance < 0.2
     filled = fill.fill_hole(hole, settings.seed)
     mattes = [cutout_opacity(cut.cutout, cut.mask, cut.hidden) for cut in cuts]
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
-    for region in shaded:
-        beyond = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
-        shadow_share = np.maximum(shadow_share, np.clip(1.25 - beyond / 2.5, 0, 1))
+    for region, view in zip(shaded, views, strict=True):
+        if region.any():
+            wide = tuple(slice(max(part.start - 4, 0), part.stop + 4) for part in view.window)
+            outside = ~view.in_frame(region, shadow_share.shape)[wide]
+            beyond = cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 5)
+            shadow_share[wide] = np.maximum(shadow_share[wide], np.clip(1.25 - beyond / 2.5, 0, 1))
     # Where a matte is thin, most of the pixel is background already: the fill fades into it.
     replaced = np.clip(np.maximum(shadow_share, (opaque - _FADE[0]) / (_FADE[1] - _FADE[0])), 0, 1)[..., None]
     mixed = image + (filled - image) * replaced
@@ -640,11 +642,13 @@ def _separate_layers(
     # Occluders are in the background too; only their border lets through what is behind.
     mixed = np.where(inputs.occluder_opacity[..., None] >= _FADE_OCCLUDER, image, mixed)
     background = np.where(replaced > 0, np.rint(mixed * 255) / 255, image).astype(np.float32)
-    owner = distance.argmin(0)
-    factors = [
-        shadow.shadow_factors(image, background, (shadow_share > 0) & (owner == i) & (opaque < 0.5) & ~in_front)
-        for i in range(len(cuts))
-    ]
+    seen = (shadow_share > 0) & (opaque < 0.5) & ~in_front
+    factors = []
+    for i, view in enumerate(views):
+        part = view.window
+        factor = shadow.shadow_factors(image[part], background[part], seen[part] & (owner[part] == i))
+        crop = _crop_nonzero(1 - factor.transpose(2, 0, 1), inverted=True)
+        factors.append(replace(crop, x0=crop.x0 + part[1].start, y0=crop.y0 + part[0].start))
     return background, mattes, factors, sun
 
 
@@ -655,7 +659,9 @@ def _find_shadows(
     vehicles: Mask,
     in_front: Mask,
 ) -> tuple[torch.Tensor, list[Mask]]:
-    """The direction towards the sun (3,), and the ground (H, W) that each vehicle shades. in_front: occluders."""
+    """The direction towards the sun (3,), and the ground (h, w) of its view's window that each vehicle shades.
+    in_front (H, W): occluders.
+    """
     placements = [cut.placement for cut in cuts]
     tight = _union([cut.mask for cut in cuts], vehicles.shape) | in_front
     sun = shadow.estimate_sun(lighting, vehicles | in_front, placements, views, ground_geometry.default_sun())
@@ -735,9 +741,11 @@ def _make_objects(labels: Labels, cuts: list[_VehicleCutout]) -> tuple[Objects, 
 
 def _matte_reach_px(cut: _VehicleCutout, opacity: Array, settings: DerenderSettings) -> float:
     """How far the matte reaches beyond the mesh's outline, with a margin, px; bounded by the vehicle's height."""
-    beyond = cv2.distanceTransform((~cut.outline).astype(np.uint8), cv2.DIST_L2, 5)
+    x0, y0, x1, y1 = silhouette.mask_bounds(cut.outline | (opacity > 0))
+    outline, opaque = cut.outline[y0:y1, x0:x1], opacity[y0:y1, x0:x1] > 0
+    beyond = cv2.distanceTransform((~outline).astype(np.uint8), cv2.DIST_L2, 5)
     limit = max(settings.max_inflation * _mask_height(cut.outline), settings.min_reach_px)
-    return float(np.clip(beyond[opacity > 0].max(initial=0) + 1.5, settings.min_reach_px, limit))
+    return float(np.clip(beyond[opaque].max(initial=0) + 1.5, settings.min_reach_px, limit))
 
 
 def _crop_nonzero(values: Array, inverted: bool = False) -> Crop:

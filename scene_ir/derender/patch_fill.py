@@ -34,8 +34,8 @@ class PatchFillSettings:
     """Pyramid levels are added until no hole is thicker than this, px."""
     max_levels: int = 6
     """Largest number of levels."""
-    iterations: tuple[int, int] = (8, 2)
-    """Search rounds at the coarsest and the finest level."""
+    iterations: tuple[int, int] = (8, 0)
+    """Search rounds at the coarsest and the finest level, which copies the pixels that the level before it found."""
     row_weight: float = 0.05
     """Cost of copying from another height, against a colour error."""
     column_weight: float = 0.004

@@ -195,17 +195,17 @@ def crop_boxes(
     Small crops of large boxes are taken from a halved (quartered, ...) image, so that no pixel is skipped.
 
     Args:
-        image: (H, W, 3) float32 or uint8; grey beyond its border.
+        image: (H, W, C) float32 or uint8; grey beyond its border.
         boxes_xyxy: (N, 4) px.
         size_hw: Height and width of the crops.
         context: Side of a crop over side of its box.
 
     Returns:
-        (N, h, w, 3).
+        (N, h, w, C).
     """
     height, width = size_hw
     halves = [image]
-    out = np.zeros((len(boxes_xyxy), height, width, 3), image.dtype)
+    out = np.zeros((len(boxes_xyxy), height, width, image.shape[2]), image.dtype)
     grey = 0.5 if image.dtype.kind == "f" else 128
     for i, (x0, y0, x1, y1) in enumerate(boxes_xyxy.astype(np.float64)):
         wide, high = context * (x1 - x0), context * (y1 - y0)
@@ -221,7 +221,7 @@ def crop_boxes(
         left = np.array([(x0 + x1 - wide) / 2, (y0 + y1 - high) / 2])
         start = (left + 0.5 * step + 0.5) * scale - 0.5
         to_image = np.array([[step[0] * scale, 0, start[0]], [0, step[1] * scale, start[1]]])
-        out[i] = cv2.warpAffine(
+        crop = cv2.warpAffine(
             halves[level],
             to_image,
             (width, height),
@@ -229,6 +229,7 @@ def crop_boxes(
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=(grey, grey, grey),
         )
+        out[i] = crop.reshape(out.shape[1:])
     return out
 
 

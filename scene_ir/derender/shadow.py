@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scene_ir.derender.silhouette import Placement, grow_mask, mask_bounds
+from scene_ir.derender.silhouette import Placement, grow_mask
 from scene_ir.image_filters import channel_max, push_pull
 from scene_ir.render.surfaces import shadow_corners, shadow_density, shadow_offset
 from scene_ir.types import Camera
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Window = tuple[slice, slice]
 
 _AZIMUTHS = 24
 _LENGTHS = (0.25, 0.5, 0.8, 1.2, 1.7, 2.3)
@@ -67,12 +69,18 @@ class GroundView:
     vehicle's frame.
     """
 
+    window: Window
+    """Rows and columns of the photograph with the ground near the footprint."""
     local: Array
-    """(H, W, 2) m, (x, z); inf outside the window."""
+    """(h, w, 2) m, (x, z), of the window's pixels; inf where they show no ground."""
     distance: Array
-    """(H, W) m from the footprint, negative inside; inf outside the window."""
-    window: tuple[slice, slice]
-    """Rows and columns of the ground near the footprint."""
+    """(h, w) m from the footprint, negative inside; inf where they show no ground."""
+
+    def in_frame(self, values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+        """Values (h, w) of the window in a photograph of a shape (H, W), 0 elsewhere."""
+        frame = np.zeros(shape[:2], values.dtype)
+        frame[self.window] = values
+        return frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,17 +128,26 @@ def view_ground(placement: Placement, ground: torch.Tensor, camera: Camera) -> G
     local = np.stack([cos * east - sin * north, sin * east + cos * north], -1)
     across, ahead = np.abs(local[..., 0]) - half[0], np.abs(local[..., 1]) - half[1]
     apart = np.hypot(np.maximum(across, 0), np.maximum(ahead, 0)) + np.minimum(np.maximum(across, ahead), 0)
-    view = GroundView(
-        np.full((camera.height, camera.width, 2), np.inf, np.float32),
-        np.full((camera.height, camera.width), np.inf, np.float32),
+    return GroundView(
         window,
+        np.where(hit[..., None], local, np.inf).astype(np.float32),
+        np.where(hit, apart, np.inf).astype(np.float32),
     )
-    view.local[window] = np.where(hit[..., None], local, np.inf)
-    view.distance[window] = np.where(hit, apart, np.inf)
-    return view
 
 
-def _image_window(corners: NDArray[np.float64], camera: Camera) -> tuple[slice, slice]:
+def nearest_views(views: Sequence[GroundView], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], Array]:
+    """The view (H, W) of each pixel of a photograph with the nearest footprint, 0 where there is none, and the
+    distance (H, W) m, inf where there is none.
+    """
+    owner, nearest = np.zeros(shape[:2], np.int64), np.full(shape[:2], np.inf, np.float32)
+    for index, view in enumerate(views):
+        closer = view.distance < nearest[view.window]
+        owner[view.window][closer] = index
+        nearest[view.window][closer] = view.distance[closer]
+    return owner, nearest
+
+
+def _image_window(corners: NDArray[np.float64], camera: Camera) -> Window:
     """Rows and columns of the image around a convex polygon with corners (3, K) in clip space, in order."""
     depth = corners[2] - _NEAR_M
     following, after = np.roll(corners, -1, 1), np.roll(depth, -1)
@@ -162,7 +179,7 @@ def estimate_ground_light(
     Returns:
         Both brightnesses.
     """
-    zone = np.logical_or.reduce([view.distance < _REACH_M for view in views]) | grow_mask(vehicles, 3)
+    zone = (nearest_views(views, vehicles.shape)[1] < _REACH_M) | grow_mask(vehicles, 3)
     return GroundLight(_brightness(image), _brightness(continue_street(zone)))
 
 
@@ -182,7 +199,7 @@ def cast_box_shadow(placement: Placement, view: GroundView, sun: torch.Tensor) -
         sun: Direction (3,) towards the sun.
 
     Returns:
-        (H, W) in [0, 1]; 0 out of the shadow's reach.
+        (h, w) in [0, 1], of the view's window; 0 out of the shadow's reach.
     """
     dark = np.zeros(view.distance.shape, np.float32)
     near = reachable_ground(placement, view, sun)
@@ -209,50 +226,61 @@ def find_shadows(
         lighting: Actual and shadow-free brightness.
         vehicles: All vehicles' pixels (H, W).
         views: The ground around each vehicle.
-        allowed: Ground (H, W) that each vehicle's shadow can reach.
-        casts: Darkness (H, W) of each vehicle's box shadow.
+        allowed: Ground (h, w) of each view's window that the vehicle's shadow can reach.
+        casts: Darkness (h, w) there of each vehicle's box shadow.
 
     Returns:
-        Each vehicle's shadow (H, W), and the number of dark pixels beyond reach.
+        Each vehicle's shadow (h, w) in its view's window, and the number of dark pixels beyond reach.
     """
     if not views:
         return [], 0
-    frame = vehicles.shape
     part = _union_window(views)
-    lighting = GroundLight(lighting.grey[part], lighting.lit[part])
-    vehicles, allowed, casts = vehicles[part], [a[part] for a in allowed], [c[part] for c in casts]
-    near = np.stack([view.distance[part] for view in views])
-    owner, nearest = near.argmin(0), near.min(0)
+    lighting, vehicles = GroundLight(lighting.grey[part], lighting.lit[part]), vehicles[part]
+    windows = [_relative_window(view.window, part) for view in views]
+    views = [replace(view, window=window) for view, window in zip(views, windows, strict=True)]
+    owner, nearest = nearest_views(views, vehicles.shape)
+    darkest, reached = np.zeros(vehicles.shape, np.float32), np.zeros(vehicles.shape, bool)
+    for window, cast, ground in zip(windows, casts, allowed, strict=True):
+        darkest[window] = np.maximum(darkest[window], cast)
+        reached[window] |= ground
     around = (nearest < _FAR_M + _RIM_M) & ~vehicles
-    free = around & (np.max(casts, axis=0) < _BOX_SHADOW) & (nearest > _LOOSE_M)
+    free = around & (darkest < _BOX_SHADOW) & (nearest > _LOOSE_M)
     open_light = push_pull(np.ascontiguousarray(lighting.grey[..., None]), free.astype(np.float32))[..., 0]
     dark = around & (lighting.grey < _DARK * np.maximum(lighting.lit, open_light))
     stands_out = dark & (lighting.grey < _DARK * open_light)
-    within = np.logical_or.reduce(allowed) & (nearest < _FAR_M)
+    within = reached & (nearest < _FAR_M)
     soft = around & (lighting.grey < _SOFT * lighting.lit) & (lighting.grey < _SOFT * open_light)
     shadows, spilled = [], 0
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-    for index in range(len(views)):
-        touching = (near[index] < _CONTACT_M) & ~vehicles & (owner == index)
-        core = stands_out & (casts[index] > _CORE)
+    for index, (view, ground, cast) in enumerate(zip(views, allowed, casts, strict=True)):
+        cast = view.in_frame(cast, vehicles.shape)
+        touching = view.in_frame(view.distance < _CONTACT_M, vehicles.shape) & ~vehicles & (owner == index)
+        core = stands_out & (cast > _CORE)
         own = _connected_to(dark, touching)
         beyond = own & ~within
         if np.count_nonzero(beyond) > _SPILL_SHARE * max(np.count_nonzero(own), 1):
             shade = float(np.median(lighting.grey[beyond]))
             own = _connected_to(dark & (lighting.grey < _DARK * shade), touching)
-            own |= _connected_to(stands_out & (casts[index] > _BOX_SHADOW), core)
+            own |= _connected_to(stands_out & (cast > _BOX_SHADOW), core)
             spilled += int(np.count_nonzero(beyond))
         else:
             own |= _connected_to(stands_out, core)
-        own |= _connected_to(soft & (casts[index] > _BOX_SHADOW), own)
+        own |= _connected_to(soft & (cast > _BOX_SHADOW), own)
         closed = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_CLOSE, disc) > 0
-        mask = np.zeros(frame, bool)
-        mask[part] = closed & ~vehicles & allowed[index] & (owner == index) & (nearest < _FAR_M)
-        shadows.append(mask)
+        shadow = closed & ~vehicles & (owner == index) & (nearest < _FAR_M)
+        shadows.append(shadow[view.window] & ground)
     return shadows, spilled
 
 
-def _union_window(views: Sequence[GroundView]) -> tuple[slice, slice]:
+def _relative_window(window: Window, part: Window) -> Window:
+    """A window's rows and columns within a part of the photograph that holds it."""
+    rows, columns = (
+        slice(one.start - of.start, one.stop - of.start) for one, of in zip(window, part, strict=True)
+    )
+    return rows, columns
+
+
+def _union_window(views: Sequence[GroundView]) -> Window:
     """The window of at least one pixel that holds all views' windows."""
     spans = [[(view.window[axis].start, view.window[axis].stop) for view in views] for axis in (0, 1)]
     starts, stops = zip(*((min(a for a, _ in span), max(b for _, b in span)) for span in spans), strict=True)
@@ -288,9 +316,10 @@ def estimate_sun(
         Direction (3,) towards the sun.
     """
     points, sizes, yaws, darkness = [], [], [], []
-    owner = np.stack([view.distance for view in views]).argmin(0)
+    owner, _ = nearest_views(views, vehicles.shape)
+    outside = ~grow_mask(vehicles, 2)
     for index, (placement, view) in enumerate(zip(placements, views, strict=True)):
-        ground = (view.distance < _REACH_M) & ~grow_mask(vehicles, 2) & (owner == index)
+        ground = (view.distance < _REACH_M) & outside[view.window] & (owner[view.window] == index)
         flat = np.nonzero(ground.reshape(-1))[0]
         flat = flat[:: max(1, len(flat) // _SAMPLES)]
         if not len(flat):
@@ -298,7 +327,8 @@ def estimate_sun(
         points.append(torch.from_numpy(view.local.reshape(-1, 2)[flat]))
         sizes.append(placement.size_lhw.detach())
         yaws.append(placement.yaw.detach())
-        shade = 1 - lighting.grey.reshape(-1)[flat] / np.maximum(lighting.lit.reshape(-1)[flat], 0.02)
+        grey, lit = (light[view.window].reshape(-1)[flat] for light in (lighting.grey, lighting.lit))
+        shade = 1 - grey / np.maximum(lit, 0.02)
         darkness.append(torch.from_numpy(np.clip(shade, 0, 1)))
     if not points:
         return assumed
@@ -366,34 +396,27 @@ def reachable_ground(placement: Placement, view: GroundView, sun: torch.Tensor) 
         sun: Direction (3,) towards the sun.
 
     Returns:
-        Mask (H, W).
+        Mask (h, w) of the view's window.
     """
     size = placement.size_lhw.detach()[None]
     offset = shadow_offset(sun, placement.yaw.detach()[None], size[:, 1])
     corners = shadow_corners(size, offset)[0].numpy()
     low, high = corners.min(0), corners.max(0)
     low, high = low + 0.05, high - 0.05
-    x, z = view.local[view.window][..., 0], view.local[view.window][..., 1]
-    reach = np.zeros(view.distance.shape, bool)
-    reach[view.window] = (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
-    return reach
+    x, z = view.local[..., 0], view.local[..., 1]
+    return (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
 
 
 def shadow_factors(image: Array, background: Array, region: Mask) -> Array:
     """Factor by which one vehicle darkens the ground: photograph / background.
 
     Args:
-        image: The photograph (H, W, 3).
+        image: The photograph (H, W, 3), or a part of it.
         background: The background (H, W, 3).
         region: The vehicle's shadow (H, W).
 
     Returns:
         (H, W, 3) in [0, 1]; 1 outside the region.
     """
-    factor = np.ones(image.shape, np.float32)
-    if region.any():
-        x0, y0, x1, y1 = mask_bounds(region)
-        part = slice(y0, y1), slice(x0, x1)
-        seen = np.clip(image[part] / np.maximum(background[part], 1 / 255), 0, 1)
-        factor[part] = np.where(region[part][..., None], seen, 1)
-    return factor
+    seen = np.clip(image / np.maximum(background, 1 / 255), 0, 1)
+    return np.where(region[..., None], seen, 1).astype(np.float32)

@@ -8,20 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from scene_ir import ffd as lattice
 from scene_ir.geometry import place_vertices, to_clip
 from scene_ir.meshes.lod import level_of_detail
 from scene_ir.meshes.templates import template
 from scene_ir.raster import verbs
-from scene_ir.types import LATTICE, LATTICE_POINTS, Camera, Mesh
+from scene_ir.types import LATTICE, LATTICE_POINTS, Camera, Mesh, Part
 
 Mask = NDArray[np.bool_]
 
@@ -210,7 +211,8 @@ def render_silhouettes(
     """
     if not placements:
         return []
-    clip, faces, vertex_ranges, face_ranges = _pack_meshes(placements, camera.matrix)
+    clip, vertex_ranges = _join_vertices([placement.vertices() for placement in placements], camera.matrix)
+    faces, face_ranges = _join_faces([placement.mesh for placement in placements])
     rects = verbs.bounding_rects(clip, vertex_ranges, camera.height, camera.width)
     layout = verbs.PixelLayout.from_rects(rects)
     hit = (verbs.rasterize(clip, faces, face_ranges, layout, backend).face >= 0).cpu().numpy()
@@ -241,8 +243,8 @@ def mask_iou(first: Mask, second: Mask, unknown: Mask | None = None) -> float:
 
 def mask_bounds(mask: Mask) -> tuple[int, int, int, int]:
     """Bounding rectangle x0, y0, x1, y1, half-open, of a non-empty mask."""
-    rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+    x0, y0, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return x0, y0, x0 + width, y0 + height
 
 
 def grow_mask(mask: Mask, radius: float) -> Mask:
@@ -373,11 +375,10 @@ def fit_silhouettes(
     windows = [_make_window(*pixels, evidence.picture) for pixels in zip(masks, unknown, outlines, strict=True)]
     rects = torch.tensor([[0, 0, w.pull.shape[1], w.pull.shape[0]] for w in windows])
     layout = verbs.PixelLayout.from_rects(rects)
-    whole, placements = placements, _with_coarse_meshes(placements)
+    coarse = _MeshBatch.from_placements(placements)
     pull = torch.from_numpy(np.concatenate([w.pull.reshape(-1) / w.length for w in windows]))
-    faces, _, face_ranges = _pack_meshes(placements, camera.matrix)[1:]
-    matrices = [w.zoom @ camera.matrix for w in windows]
-    weights = [lattice.lattice_weights(p.mesh.vertices) for p in placements]
+    matrices = torch.stack([w.place.zoom @ camera.matrix for w in windows])
+    limits = _BoxLimits.from_windows(boxes, windows)
     modes = _deformation_modes()
     spread, bound = _code_scales(settings, len(modes))
     spread, bound = spread.repeat(len(placements), 1), bound.repeat(len(placements), 1)
@@ -388,30 +389,21 @@ def fit_silhouettes(
     mean, square = torch.zeros_like(code), torch.zeros_like(code)
     best = torch.full((len(placements),), torch.inf)
     best_code = code.detach().clone()
-    contours: list[VisibleContour] = []
+    edges: EdgeSamples | None = None
     for step in range(settings.steps + 1):
-        clips = []
-        for i, (placement, weight, matrix) in enumerate(zip(placements, weights, matrices, strict=True)):
-            moved = _apply_change(placement, code[i] * spread[i], modes)
-            unit = lattice.deform(placement.mesh.vertices, weight, moved.ffd)
-            clips.append(to_clip(place_vertices(unit, moved.size_lhw, moved.yaw, moved.translation), matrix))
-        clip = torch.cat(clips)
-        fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
-        covered = verbs.antialias(fragments, clip, faces, backend) * pull
+        clips = coarse.project(code * spread, modes, matrices)
+        clip = clips[coarse.valid]
+        fragments = verbs.rasterize(clip, coarse.faces, coarse.face_ranges, layout, backend)
+        covered = verbs.antialias(fragments, clip, coarse.faces, backend) * pull
         energy = torch.stack([covered[span].sum() for span, _ in layout.spans()])
-        sides = [_box_distances(c, box, w) for c, box, w in zip(clips, boxes.xyxy, windows, strict=True)]
-        box_loss = (torch.stack(sides) * boxes.trust).sum(1)
+        box_loss = (limits.distances(clips, coarse.valid) * boxes.trust).sum(1)
         loss = energy + settings.prior * code.square().sum(1) + settings.box * box_loss
         if evidence.picture is not None and settings.edges > 0:
-            if step % _RETRACE_STEPS == 0:
-                contours = _trace_contours(placements, windows, clips, fragments)
+            if edges is None or step % _RETRACE_STEPS == 0:
+                edges = _trace_edges(coarse.meshes, windows, clip, fragments)
                 # Losses with other edges do not compare.
                 best = torch.full_like(best, torch.inf)
-            inner = [
-                contour_distance(window.edges, contour, c)
-                for window, contour, c in zip(windows, contours, clips, strict=True)
-            ]
-            loss = loss + settings.edges * torch.stack(inner)
+            loss = loss + settings.edges * edges.distances(clip)
         better = loss.detach() < best
         best = torch.where(better, loss.detach(), best)
         best_code = torch.where(better[:, None], code.detach(), best_code)
@@ -427,12 +419,69 @@ def fit_silhouettes(
             scale = (square / (1 - _ADAM[1] ** (step + 1))).sqrt() + 1e-8
             code -= settings.rate * mean / (1 - _ADAM[0] ** (step + 1)) / scale
             code.clamp_(-bound / spread, bound / spread)
-    return [_apply_change(p, c, modes) for p, c in zip(whole, best_code * spread, strict=True)]
+    fitted = zip(*coarse.pose.changed(best_code * spread, modes), strict=True)
+    return [Placement(placement.mesh, *parts) for placement, parts in zip(placements, fitted, strict=True)]
 
 
-def _with_coarse_meshes(placements: Sequence[Placement]) -> list[Placement]:
-    """The placements with the meshes' level of detail for windows."""
-    return [replace(p, mesh=level_of_detail(p.mesh, _DETAIL_PX)) for p in placements]
+class _Poses(NamedTuple):
+    """Poses, sizes and shapes of N placed meshes."""
+
+    translation: Tensor
+    """(N, 3) m."""
+    yaw: Tensor
+    """(N,) rad."""
+    size_lhw: Tensor
+    """(N, 3) m."""
+    ffd: Tensor
+    """(N, 64, 3)."""
+
+    def changed(self, change: Tensor, modes: Tensor) -> _Poses:
+        """After changes (N, K) in the order of `_code_scales`; modes (K - 7, 64, 3)."""
+        return _Poses(
+            self.translation + change[:, [0, 2, 1]],
+            self.yaw + change[:, 3],
+            self.size_lhw * torch.exp(change[:, 4:7]),
+            self.ffd + (change[:, 7:] @ modes.flatten(1)).unflatten(1, modes.shape[1:]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _MeshBatch:
+    """Placed meshes at the windows' level of detail, padded to one number of vertices."""
+
+    meshes: tuple[Mesh, ...]
+    """N meshes."""
+    unit: Tensor
+    """(N, V, 3), vertices in the unit box."""
+    weights: Tensor
+    """(N, V, 64), of the lattice points."""
+    valid: Tensor
+    """(N, V) bool, vertices that are no padding."""
+    faces: Tensor
+    """(F, 3) int64, of all meshes, in terms of their valid vertices."""
+    face_ranges: Tensor
+    """(N, 2)."""
+    pose: _Poses
+    """Where they are placed."""
+
+    @classmethod
+    def from_placements(cls, placements: Sequence[Placement]) -> _MeshBatch:
+        meshes = tuple(level_of_detail(p.mesh, _DETAIL_PX) for p in placements)
+        unit = pad_sequence([mesh.vertices for mesh in meshes], batch_first=True)
+        weights = pad_sequence([lattice.lattice_weights(mesh.vertices) for mesh in meshes], batch_first=True)
+        counts = torch.tensor([len(mesh.vertices) for mesh in meshes])
+        valid = torch.arange(unit.shape[1]) < counts[:, None]
+        faces, face_ranges = _join_faces(meshes)
+        names = ("translation", "yaw", "size_lhw", "ffd")
+        pose = _Poses(*(torch.stack([getattr(p, name).detach() for p in placements]) for name in names))
+        return cls(meshes, unit, weights, valid, faces, face_ranges, pose)
+
+    def project(self, change: Tensor, modes: Tensor, matrices: Tensor) -> Tensor:
+        """Clip coordinates (N, V, 3) after changes (N, K), by matrices (N, 3, 4)."""
+        pose = self.pose.changed(change, modes)
+        deformed = lattice.deform(self.unit, self.weights, pose.ffd)
+        points = place_vertices(deformed, pose.size_lhw, pose.yaw, pose.translation)
+        return points @ matrices[:, :, :3].transpose(1, 2) + matrices[:, None, :, 3]
 
 
 def measure_edge_distances(
@@ -454,55 +503,121 @@ def measure_edge_distances(
     Returns:
         N distances in [0, 1]; 1 for a mesh that is not visible.
     """
-    covered = np.logical_or.reduce(render_silhouettes(placements, camera, backend))
-    if not covered.any():
+    placements = [replace(p, mesh=level_of_detail(p.mesh, _DETAIL_PX)) for p in placements]
+    vertices = [placement.vertices() for placement in placements]
+    clip, vertex_ranges = _join_vertices(vertices, camera.matrix)
+    rects = verbs.bounding_rects(clip, vertex_ranges, camera.height, camera.width, margin=0)
+    rects = rects[(rects[:, 2:] > rects[:, :2]).all(1)]
+    if not len(rects):
         return [1.0] * len(placements)
-    windows = [_make_window(covered, unknown, covered, picture)] * len(placements)
-    placements = _with_coarse_meshes(placements)
-    height, width = windows[0].known.shape
-    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, width, height]] * len(placements)))
-    clip, faces, vertex_ranges, face_ranges = _pack_meshes(placements, windows[0].zoom @ camera.matrix)
+    x0, y0, x1, y1 = (*rects[:, :2].amin(0).tolist(), *rects[:, 2:].amax(0).tolist())
+    window = _Window.around((x0, y0, x1, y1), unknown.shape)
+    known = window.nearest(~unknown)
+    field = compute_edge_field(window.resize(picture), grow_mask(~known, 1))
+    layout = verbs.PixelLayout.from_rects(torch.tensor([[0, 0, *window.size_wh]] * len(placements)))
+    faces, face_ranges = _join_faces([placement.mesh for placement in placements])
+    clip, _ = _join_vertices(vertices, window.zoom @ camera.matrix)
     fragments = verbs.rasterize(clip, faces, face_ranges, layout, backend)
-    clips = [clip[start:end] for start, end in vertex_ranges.tolist()]
-    contours = _trace_contours(placements, windows, clips, fragments)
-    return [
-        float(contour_distance(window.edges, contour, clip)) if len(contour.channel) else 1.0
-        for window, contour, clip in zip(windows, contours, clips, strict=True)
-    ]
+    meshes = [placement.mesh for placement in placements]
+    contours = _trace_contours(meshes, [known] * len(meshes), clip, fragments)
+    samples = EdgeSamples.from_contours([field] * len(meshes), contours, [len(mesh.vertices) for mesh in meshes])
+    return torch.where(samples.count > 0, samples.distances(clip), 1.0).tolist()
+
+
+def _trace_edges(
+    meshes: Sequence[Mesh], windows: Sequence[_FitWindow], clip: Tensor, fragments: verbs.Fragments
+) -> EdgeSamples:
+    """The visible edges of the meshes, each in its window's field. clip (V, 3): of all vertices."""
+    contours = _trace_contours(meshes, [window.known for window in windows], clip, fragments)
+    return EdgeSamples.from_contours(
+        [window.edges for window in windows], contours, [len(mesh.vertices) for mesh in meshes]
+    )
 
 
 def _trace_contours(
-    placements: Sequence[Placement],
-    windows: Sequence[_FitWindow],
-    clips: Sequence[Tensor],
-    fragments: verbs.Fragments,
+    meshes: Sequence[Mesh], known: Sequence[Mask], clip: Tensor, fragments: verbs.Fragments
 ) -> list[VisibleContour]:
-    """The visible edges of each placed mesh in its window."""
-    contours = []
-    spans = fragments.layout.spans()
-    start = 0
-    for placement, window, clip, (span, shape) in zip(placements, windows, clips, spans, strict=True):
-        mesh = placement.mesh
+    """The visible edges of each mesh in its window, with the pixels (h, w) that nothing nearer hides there."""
+    contours, face_start, vertex_start = [], 0, 0
+    for mesh, pixels, (span, shape) in zip(meshes, known, fragments.layout.spans(), strict=True):
         face = fragments.face[span].reshape(shape).long()
-        face = torch.where(face >= 0, face - start, face)
+        face = torch.where(face >= 0, face - face_start, face)
         depth = fragments.depth[span].reshape(shape)
-        contours.append(trace_contour(face, depth, clip, mesh.faces, mesh.part, window.known))
-        start += len(mesh.faces)
+        own = clip[vertex_start : vertex_start + len(mesh.vertices)]
+        contours.append(trace_contour(face, depth, own, mesh.faces, mesh.part, pixels))
+        face_start, vertex_start = face_start + len(mesh.faces), vertex_start + len(mesh.vertices)
     return contours
 
 
-def _box_distances(clip: Tensor, box_xyxy: Tensor, window: _FitWindow) -> Tensor:
-    """Squared distances (4,) of a mesh's extent from a label's box on each side, in units of the band."""
-    # Points beyond the image's border are in no box; points nearer than half a metre project anywhere.
-    pixels = clip[:, :2] / clip[:, 2:].clamp(min=0.5)
-    visible = ((pixels >= window.frame[:2]) & (pixels <= window.frame[2:])).all(1) & (clip[:, 2] > 0.5)
-    if not bool(visible.any()):
-        return box_xyxy.new_zeros(4)
-    extremes = torch.cat([pixels[visible].amin(0), pixels[visible].amax(0)])
-    scale = window.zoom.diagonal()[:2].repeat(2)
-    offset = window.zoom[:2, 2].repeat(2)
-    band = _BAND * max(window.pull.shape)
-    return (((extremes - (box_xyxy * scale + offset)) / band).clamp(-3, 3)) ** 2
+@dataclass(frozen=True, slots=True)
+class _BoxLimits:
+    """Where the sides of N labels' 2D boxes lie in the windows."""
+
+    sides: Tensor
+    """(N, 4) px of the window, xyxy."""
+    frame: Tensor
+    """(N, 4) px, the image's border in the window, xyxy."""
+    band: Tensor
+    """(N, 1) px, unit of the distances."""
+
+    @classmethod
+    def from_windows(cls, boxes: LabelBoxes, windows: Sequence[_FitWindow]) -> _BoxLimits:
+        zoom = torch.stack([window.place.zoom for window in windows])
+        scale, offset = zoom.diagonal(dim1=1, dim2=2)[:, :2].repeat(1, 2), zoom[:, :2, 2].repeat(1, 2)
+        band = torch.tensor([[_BAND * max(window.pull.shape)] for window in windows])
+        return cls(boxes.xyxy * scale + offset, torch.stack([window.frame for window in windows]), band)
+
+    def distances(self, clip: Tensor, valid: Tensor) -> Tensor:
+        """Squared distances (N, 4) of the meshes' extents from the boxes on each side, in units of the band; 0 for a
+        mesh out of sight. clip (N, V, 3); valid (N, V): vertices that are no padding.
+        """
+        # Points beyond the image's border are in no box; points nearer than half a metre project anywhere.
+        pixels = clip[..., :2] / clip[..., 2:].clamp(min=0.5)
+        inside = ((pixels >= self.frame[:, None, :2]) & (pixels <= self.frame[:, None, 2:])).all(2)
+        visible = (inside & (clip[..., 2] > 0.5) & valid)[..., None]
+        low, high = (torch.where(visible, pixels, sign * torch.inf) for sign in (1, -1))
+        extremes = torch.cat([low.amin(1), high.amax(1)], 1)
+        seen = visible.any(1)
+        apart = (torch.where(seen, extremes, self.sides) - self.sides) / self.band
+        return apart.clamp(-3, 3) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """A part of the photograph, resized."""
+
+    part: tuple[slice, slice]
+    """Rows and columns of the photograph."""
+    size_wh: tuple[int, int]
+    """Its size, px."""
+    scale: float
+    """Pixels of the window per pixel of the photograph."""
+    zoom: Tensor
+    """(3, 3), image pixels to window pixels."""
+
+    @classmethod
+    def around(cls, bounds: tuple[int, int, int, int], shape: tuple[int, ...]) -> _Window:
+        """The window around a rectangle x0, y0, x1, y1 of a photograph of a shape (H, W)."""
+        x0, y0, x1, y1 = bounds
+        margin = int(0.15 * max(x1 - x0, y1 - y0)) + 3
+        x0, y0 = max(x0 - margin, 0), max(y0 - margin, 0)
+        x1, y1 = min(x1 + margin, shape[1]), min(y1 + margin, shape[0])
+        scale = min(_WORK_PX / max(x1 - x0, y1 - y0), 4.0)
+        size = (max(round((x1 - x0) * scale), 1), max(round((y1 - y0) * scale), 1))
+        across, down = size[0] / (x1 - x0), size[1] / (y1 - y0)
+        zoom = [[across, 0.0, (0.5 - x0) * across - 0.5], [0.0, down, (0.5 - y0) * down - 0.5], [0.0, 0.0, 1.0]]
+        return cls((slice(y0, y1), slice(x0, x1)), size, scale, torch.tensor(zoom))
+
+    def resize(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The window (h, w, 3) of a photograph (H, W, 3)."""
+        method = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_CUBIC
+        crop = cv2.resize(picture[self.part], self.size_wh, interpolation=method)
+        return np.asarray(crop, np.uint8).reshape(*self.size_wh[::-1], 3)
+
+    def nearest(self, mask: Mask) -> Mask:
+        """The window (h, w) of a mask (H, W)."""
+        part = mask[self.part].astype(np.uint8)
+        return cv2.resize(part, self.size_wh, interpolation=cv2.INTER_NEAREST).reshape(self.size_wh[::-1]) > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -513,8 +628,8 @@ class _FitWindow:
     """(h, w) in [-2, 1], signed distance to the mask over the band, 0 where unknown."""
     length: float
     """Perimeter of the window, px."""
-    zoom: Tensor
-    """(3, 3), image pixels to window pixels."""
+    place: _Window
+    """Where it lies."""
     frame: Tensor
     """(4,) px, the image's border xyxy in the window."""
     edges: Tensor
@@ -526,15 +641,11 @@ class _FitWindow:
 def _make_window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.uint8] | None) -> _FitWindow:
     height, width = mask.shape
     both = mask | outline
-    x0, y0, x1, y1 = mask_bounds(both) if both.any() else (0, 0, 1, 1)
-    margin = int(0.15 * max(x1 - x0, y1 - y0)) + 3
-    x0, y0, x1, y1 = max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)
-    scale = min(_WORK_PX / max(x1 - x0, y1 - y0), 4.0)
-    size = (max(round((x1 - x0) * scale), 1), max(round((y1 - y0) * scale), 1))
-    inner = mask[y0:y1, x0:x1]
+    window = _Window.around(mask_bounds(both) if both.any() else (0, 0, 1, 1), mask.shape)
+    scale, size = window.scale, window.size_wh
+    inner, visible = mask[window.part], ~unknown[window.part]
     # Hidden pixels next to the mask belong to neither side: distances are to pixels that are certainly not the
     # car.
-    visible = ~unknown[y0:y1, x0:x1]
     to_car = cv2.distanceTransform((~inner).astype(np.uint8), cv2.DIST_L2, 5)
     to_rest = cv2.distanceTransform((inner | ~visible).astype(np.uint8), cv2.DIST_L2, 5)
     to_car = np.where(inner.any(), to_car, max(size))
@@ -544,45 +655,38 @@ def _make_window(mask: Mask, unknown: Mask, outline: Mask, picture: NDArray[np.u
     pull = np.clip(signed / band, -1, 1) * visible
     # A piece of car outside the mesh tears off when the car turns; a piece of road inside it only moves along.
     pull = np.where(pull < 0, _MISSED_WEIGHT * pull, pull)
-    zoom = torch.tensor(
-        [
-            [size[0] / (x1 - x0), 0.0, (0.5 - x0) * size[0] / (x1 - x0) - 0.5],
-            [0.0, size[1] / (y1 - y0), (0.5 - y0) * size[1] / (y1 - y0) - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
     resized = cv2.resize(
         pull.astype(np.float32), size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     )
-    corners = torch.tensor([[0.0, 0.0, 1.0], [width - 1.0, height - 1.0, 1.0]]) @ zoom.T
-    known = cv2.resize(visible.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).reshape(size[::-1]) > 0
-    edges = torch.zeros(0)
+    corners = torch.tensor([[0.0, 0.0, 1.0], [width - 1.0, height - 1.0, 1.0]]) @ window.zoom.T
+    known, edges = window.nearest(~unknown), torch.zeros(0)
     if picture is not None:
-        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-        crop = cv2.resize(picture[y0:y1, x0:x1], size, interpolation=method)
-        edges = compute_edge_field(np.asarray(crop, np.uint8).reshape(*size[::-1], 3), grow_mask(~known, 1))
+        edges = compute_edge_field(window.resize(picture), grow_mask(~known, 1))
     return _FitWindow(
         np.asarray(resized, np.float32).reshape(size[::-1]),
         2.0 * (size[0] + size[1]),
-        zoom,
+        window,
         corners[:, :2].reshape(4),
         edges,
         known,
     )
 
 
-def _pack_meshes(placements: Sequence[Placement], matrix: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Clip coordinates, faces, vertex ranges (N, 2) and face ranges (N, 2) of all placements in one draw."""
-    clips, faces, vertex_ranges, face_ranges = [], [], [], []
-    vertex = face = 0
-    for placement in placements:
-        mesh = placement.mesh
-        clips.append(to_clip(placement.vertices(), matrix))
+def _join_vertices(vertices: Sequence[Tensor], matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Clip coordinates of all meshes' vertices (V, 3), and each mesh's range of them (N, 2)."""
+    ends = torch.tensor([len(part) for part in vertices]).cumsum(0)
+    starts = torch.cat([ends.new_zeros(1), ends[:-1]])
+    return to_clip(torch.cat(list(vertices)), matrix), torch.stack([starts, ends], 1)
+
+
+def _join_faces(meshes: Sequence[Mesh]) -> tuple[Tensor, Tensor]:
+    """Faces (F, 3) of all meshes in one draw, and each mesh's range of them (N, 2)."""
+    faces, ranges, vertex, face = [], [], 0, 0
+    for mesh in meshes:
         faces.append(mesh.faces + vertex)
-        vertex_ranges.append([vertex, vertex + len(mesh.vertices)])
-        face_ranges.append([face, face + len(mesh.faces)])
-        vertex, face = vertex_ranges[-1][1], face_ranges[-1][1]
-    return torch.cat(clips), torch.cat(faces), torch.tensor(vertex_ranges), torch.tensor(face_ranges)
+        ranges.append([face, face + len(mesh.faces)])
+        vertex, face = vertex + len(mesh.vertices), face + len(mesh.faces)
+    return torch.cat(faces), torch.tensor(ranges)
 
 
 def _deformation_modes() -> Tensor:
@@ -618,17 +722,6 @@ def _code_scales(settings: FitSettings, modes: int) -> tuple[Tensor, Tensor]:
     spread = torch.tensor(bound) / 2
     spread[7:] = settings.max_offset / 3
     return spread, torch.tensor(bound)
-
-
-def _apply_change(placement: Placement, change: Tensor, modes: Tensor) -> Placement:
-    """The placement after a change of pose, size and shape, in the order of `_units`."""
-    return replace(
-        placement,
-        translation=placement.translation + torch.stack([change[0], change[2], change[1]]),
-        yaw=placement.yaw + change[3],
-        size_lhw=placement.size_lhw * torch.exp(change[4:7]),
-        ffd=placement.ffd + torch.einsum("k,kpc->pc", change[7:], modes),
-    )
 
 
 def place_mesh(mesh: str | Mesh, translation: Tensor, yaw: Tensor, size_lhw: Tensor) -> Placement:
@@ -723,13 +816,9 @@ def trace_contour(
     y, x, offset = np.concatenate(rows), np.concatenate(columns), np.concatenate(offsets)
     chosen = np.linspace(0, len(y) - 1, min(len(y), _MOST_POINTS)).astype(int)
     y, x, offset = y[chosen], x[chosen], offset[chosen]
-    smooth, point_kind = np.zeros((2, len(y)), np.float32), kind[y, x]
-    for value in np.unique(point_kind):
-        blurred = cv2.GaussianBlur((kind == value).astype(np.float32), (0, 0), 1.5)
-        mine = point_kind == value
-        for axis, order in enumerate(((1, 0), (0, 1))):
-            smooth[axis, mine] = cv2.Sobel(blurred, cv2.CV_32F, *order)[y[mine], x[mine]]
-    angle = np.arctan2(smooth[1], smooth[0])
+    blurred = cv2.GaussianBlur((kind[..., None] == np.arange(len(Part))).astype(np.float32), (0, 0), 1.5)
+    dx, dy = (cv2.Sobel(blurred, cv2.CV_32F, *order)[y, x, kind[y, x]] for order in ((1, 0), (0, 1)))
+    angle = np.arctan2(dy, dx)
     channel = np.rint(angle / np.pi * _CHANNELS).astype(np.int64) % _CHANNELS
     vertex = faces[face[torch.from_numpy(y), torch.from_numpy(x)]]
     corners = clip.detach()[vertex].double().transpose(1, 2)
@@ -747,22 +836,73 @@ def trace_contour(
     )
 
 
-def contour_distance(field: Tensor, contour: VisibleContour, clip: Tensor) -> Tensor:
-    """Mean distance of a contour from the photograph's edges, differentiable by `clip`.
+@dataclass(frozen=True, slots=True)
+class EdgeSamples:
+    """Visible edges of N meshes as P points, each in the edge field of its mesh's window."""
 
-    Args:
-        field: Distances (4, h, w) from `compute_edge_field`.
-        contour: The mesh's visible edges.
-        clip: Clip coordinates (V, 3) of the mesh's vertices.
+    vertex: Tensor
+    """(P, 3) int64, vertices of the face that each point lies on."""
+    weight: Tensor
+    """(P, 3, 1), barycentric coordinates."""
+    offset: Tensor
+    """(P, 2) px, from the point to the edge."""
+    limit: Tensor
+    """(P, 2) px, the last column and row of its field."""
+    start: Tensor
+    """(P,) int64, first value of its field and direction in `values`."""
+    mesh: Tensor
+    """(P,) int64."""
+    count: Tensor
+    """(N,), points of each mesh."""
+    values: Tensor
+    """All fields, flat."""
 
-    Returns:
-        () in [0, 1]; 0 without visible edges.
-    """
-    if not len(contour.channel):
-        return clip.new_zeros(())
-    point = (clip[contour.vertex] * contour.weight[..., None]).sum(1)
-    pixel = point[:, :2] / point[:, 2:].clamp(min=0.05) + contour.offset
-    size = pixel.new_tensor([field.shape[2], field.shape[1]])
-    grid = ((2 * pixel + 1) / size - 1)[None, None]
-    sampled = F.grid_sample(field[None], grid, padding_mode="border", align_corners=False)[0, :, 0]
-    return sampled.gather(0, contour.channel[None]).mean()
+    @classmethod
+    def from_contours(
+        cls, fields: Sequence[Tensor], contours: Sequence[VisibleContour], vertices: Sequence[int]
+    ) -> EdgeSamples:
+        """Join contours.
+
+        Args:
+            fields: N distances (4, h, w) from `compute_edge_field`.
+            contours: N meshes' visible edges.
+            vertices: N numbers of vertices, which follow each other in the clip coordinates.
+        """
+        counts = torch.tensor([len(contour.channel) for contour in contours])
+        first_vertex = torch.tensor([0, *vertices[:-1]]).cumsum(0)
+        first_value = torch.tensor([0, *(field.numel() for field in fields[:-1])]).cumsum(0)
+        size = torch.tensor([[field.shape[2], field.shape[1]] for field in fields])
+        mesh = torch.arange(len(contours)).repeat_interleave(counts)
+        channel = torch.cat([contour.channel for contour in contours])
+        return cls(
+            torch.cat([contour.vertex for contour in contours]) + first_vertex[mesh, None],
+            torch.cat([contour.weight for contour in contours])[..., None],
+            torch.cat([contour.offset for contour in contours]),
+            (size[mesh] - 1).float(),
+            first_value[mesh] + channel * size[mesh].prod(1),
+            mesh,
+            counts.float(),
+            torch.cat([field.reshape(-1) for field in fields]),
+        )
+
+    def distances(self, clip: Tensor) -> Tensor:
+        """Mean distance (N,) in [0, 1] of each mesh from the photograph's edges, differentiable by clip (V, 3); 0
+        without visible edges.
+        """
+        point = (clip[self.vertex] * self.weight).sum(1)
+        pixel = point[:, :2] / point[:, 2:].clamp(min=0.05) + self.offset
+        pixel = torch.minimum(pixel.clamp(min=0), self.limit)
+        corner = pixel.detach().floor()
+        x, y = (pixel - corner).unbind(1)
+        (left, top), (right, bottom) = (
+            at.long().unbind(1) for at in (corner, torch.minimum(corner + 1, self.limit))
+        )
+        stride = self.limit[:, 0].long() + 1
+
+        def row(line: Tensor) -> Tensor:
+            first, second = (self.values[self.start + line * stride + column] for column in (left, right))
+            return first + x * (second - first)
+
+        above, below = row(top), row(bottom)
+        sampled = above + y * (below - above)
+        return clip.new_zeros(len(self.count)).index_add(0, self.mesh, sampled) / self.count.clamp(min=1)

@@ -48,7 +48,21 @@ def level_of_detail(mesh: Mesh, height_px: float) -> Mesh:
     if count <= wanted:
         return mesh
     level = math.ceil(2 ** (math.ceil(2 * math.log2(wanted)) / 2))
-    return mesh if count <= level else _cached_level(_HashedMesh(_mesh_digest(mesh), mesh), level)
+    return mesh if count <= level else _cached_level(_HashedMesh(_mesh_digest(SameMesh(mesh)), mesh), level)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SameMesh:
+    """A mesh as a cache's key: equal to the same object only."""
+
+    mesh: Mesh
+    """The mesh, which stays alive while the cache holds it."""
+
+    def __hash__(self) -> int:
+        return id(self.mesh)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SameMesh) and self.mesh is other.mesh
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +73,9 @@ class _HashedMesh:
     mesh: Mesh = field(compare=False)
 
 
-def _mesh_digest(mesh: Mesh) -> bytes:
+@lru_cache(maxsize=64)
+def _mesh_digest(key: SameMesh) -> bytes:
+    mesh = key.mesh
     known = hashlib.blake2b(mesh.name.encode(), digest_size=16)
     for values in (mesh.vertices, mesh.faces, mesh.part, mesh.colours, mesh.uv):
         if values is None:

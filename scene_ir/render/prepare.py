@@ -200,9 +200,6 @@ class PreparedScene:
         self.frame_hw = (scene.camera.height, scene.camera.width)
         self.centre = surfaces.camera_centre(scene.camera.matrix).to(self.like)
         self.unproject = torch.linalg.inv(scene.camera.matrix[:, :3]).to(self.like)
-        self.air = sky_colour(scene.photograph, scene.environment.sky)
-        inverse = torch.where(torch.isfinite(scene.depth), 1.0 / scene.depth, torch.zeros_like(scene.depth))
-        self.canvas = torch.cat([scene.background, inverse.to(self.like)[None]])
         self.occluders = OccluderLayers.from_scene(scene, self.like) if scene.occluders else None
         self.footprints = None if self.occluders is None else self.occluders.footprints
         with torch.no_grad():
@@ -246,6 +243,18 @@ class PreparedScene:
         self.paint_lightness = self._base_lightness(objects)
         if objects.source:
             self._prepare_sources(objects, base, hidden)
+
+    @cached_property
+    def air(self) -> Tensor:
+        """Colour (3,) of the air, see `environment.sky_colour`."""
+        return sky_colour(self.scene.photograph, self.scene.environment.sky)
+
+    @cached_property
+    def canvas(self) -> Tensor:
+        """Background and its inverse depth (4, H, W)."""
+        depth = self.scene.depth
+        inverse = torch.where(torch.isfinite(depth), 1.0 / depth, torch.zeros_like(depth))
+        return torch.cat([self.scene.background, inverse.to(self.like)[None]])
 
     def _trimmed_corners(self, objects: Objects, base: Objects) -> Tensor:
         """The patches (N, 4, 2) m, cut down to what the photographed shadows darken."""

@@ -100,7 +100,9 @@ def test_nearness_is_that_of_the_ground_around_the_footprint():
     placement, ground = car(), torch.tensor([0.01, -0.9997, 0.02, 1.6])
     camera = cutout.crop_camera(CAMERA, cutout.crop_rectangle(placement, CAMERA))
     guide_maps = cutout.render_guides([placement], [camera], [ground], np.zeros((1, 2, *CROP_HW), "f4"))
-    wanted = np.clip(-shadow.view_ground(placement, ground, camera).distance / 2, -1, 1)
+    view = shadow.view_ground(placement, ground, camera)
+    wanted = np.full(CROP_HW, -1.0)
+    wanted[view.window] = np.clip(-view.distance / 2, -1, 1)
     assert np.abs(guide_maps[0, 4].numpy() - wanted).max() < 1e-4
 
 

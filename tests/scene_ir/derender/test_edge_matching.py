@@ -27,6 +27,10 @@ def followed(placement: Placement, known: np.ndarray) -> tuple[borders.VisibleCo
     return borders.trace_contour(face, depth, clip, placement.mesh.faces, placement.mesh.part, known), clip
 
 
+def distance(field: torch.Tensor, contour: borders.VisibleContour, clip: torch.Tensor) -> torch.Tensor:
+    return borders.EdgeSamples.from_contours([field], [contour], [len(clip)]).distances(clip)[0]
+
+
 def test_edges_of_a_square_pull_by_direction():
     picture = np.full((60, 80, 3), 40, np.uint8)
     picture[20:40, 30:50] = 200
@@ -72,24 +76,57 @@ def test_what_is_hidden_is_not_followed():
     assert float((point[:, 0] / point[:, 2]).max()) < 240.5
     nothing, clip = followed(car(), NOTHING)
     assert len(nothing.channel) == 0
-    assert float(borders.contour_distance(torch.ones(4, 200, 480), nothing, clip)) == 0
+    assert distance(torch.ones(4, 200, 480), nothing, clip) == 0
 
 
 def test_the_right_pose_is_nearest_and_the_slope_leads_to_it():
     field = borders.compute_edge_field(painted(car()), NOTHING)
-    distance = {}
+    distances = {}
     for turn in (-0.1, -0.05, 0.0, 0.05, 0.1):
         found, clip = followed(car(0.6 + turn), ~NOTHING)
-        distance[turn] = float(borders.contour_distance(field, found, clip))
-    assert min(distance, key=lambda turn: distance[turn]) == 0.0
-    assert distance[0.0] < 0.25
+        distances[turn] = float(distance(field, found, clip))
+    assert min(distances, key=lambda turn: distances[turn]) == 0.0
+    assert distances[0.0] < 0.25
     placement = car()
     shift = torch.tensor(0.03, requires_grad=True)
     found, _ = followed(car(x=0.53), ~NOTHING)
     moved = placement.vertices() + shift * torch.tensor([1.0, 0.0, 0.0])
-    borders.contour_distance(field, found, to_clip(moved, CAMERA.matrix)).backward()
+    distance(field, found, to_clip(moved, CAMERA.matrix)).backward()
     assert shift.grad is not None
     assert float(shift.grad) > 0
+
+
+def test_several_contours_are_sampled_as_by_torch():
+    generator = torch.Generator().manual_seed(1)
+    fields = [torch.rand(4, *hw, generator=generator) for hw in ((20, 30), (12, 9))]
+    clip = torch.rand(10, 3, generator=generator) * torch.tensor([40.0, 30.0, 0.5]) + torch.tensor([-4, -4, 0.8])
+    clip.requires_grad_(True)
+    contours = [
+        borders.VisibleContour(
+            torch.randint(0, 5, (50, 3), generator=generator),
+            torch.rand(50, 3, generator=generator),
+            torch.rand(50, 2, generator=generator),
+            torch.randint(0, 4, (50,), generator=generator),
+        )
+        for _ in fields
+    ]
+    found = borders.EdgeSamples.from_contours(fields, contours, [5, 5]).distances(clip)
+    wanted = []
+    for field, contour, own in zip(fields, contours, (clip[:5], clip[5:]), strict=True):
+        point = (own[contour.vertex] * contour.weight[..., None]).sum(1)
+        pixel = point[:, :2] / point[:, 2:].clamp(min=0.05) + contour.offset
+        grid = (2 * pixel + 1) / torch.tensor([field.shape[2], field.shape[1]]) - 1
+        sampled = torch.nn.functional.grid_sample(
+            field[None], grid[None, None], padding_mode="border", align_corners=False
+        )[0, :, 0]
+        wanted.append(sampled.gather(0, contour.channel[None]).mean())
+    torch.testing.assert_close(found, torch.stack(wanted))
+    weights = torch.tensor([1.0, 2.0])
+    slopes = [
+        torch.autograd.grad((one * weights).sum(), clip, retain_graph=True)[0]
+        for one in (found, torch.stack(wanted))
+    ]
+    torch.testing.assert_close(*slopes, atol=1e-4, rtol=1e-3)
 
 
 def test_edges_find_the_yaw_that_the_outline_leaves_open():

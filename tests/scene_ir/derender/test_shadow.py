@@ -22,6 +22,18 @@ def view() -> shadow.GroundView:
     return shadow.view_ground(CAR, LEVEL, CAMERA)
 
 
+def whole(ground: shadow.GroundView, name: str) -> np.ndarray:
+    """A field of a view in the whole picture; infinite outside the window."""
+    values = getattr(ground, name)
+    frame = np.full((200, 480, *values.shape[2:]), np.inf, np.float32)
+    frame[ground.window] = values
+    return frame
+
+
+def distance() -> np.ndarray:
+    return whole(view(), "distance")
+
+
 def vehicle() -> np.ndarray:
     return silhouette.render_silhouettes([CAR], CAMERA)[0]
 
@@ -32,8 +44,8 @@ def toward(x: float, z: float) -> torch.Tensor:
 
 def shaded(sun: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """A lit street on which the car's box shadow lies, and that shadow's factor."""
-    ground = view()
-    flat = torch.from_numpy(np.where(np.isfinite(ground.local), ground.local, 99.0)).reshape(-1, 2)
+    local = whole(view(), "local")
+    flat = torch.from_numpy(np.where(np.isfinite(local), local, 99.0)).reshape(-1, 2)
     size = CAR.size_lhw.expand(len(flat), 3)
     offset = shadow_offset(sun, CAR.yaw.expand(len(flat)), size[:, 1])
     factor = 1 - 0.8 * shadow_density(flat, size, offset).reshape(200, 480).numpy()
@@ -55,11 +67,11 @@ def test_ground_view_knows_the_footprints_corners_and_middle():
     ground = view()
     front = CAR.translation + torch.tensor([np.cos(0.4), 0, -np.sin(0.4)]).float() * 2.0
     u, v = project(front, CAMERA.matrix).round().long().tolist()
-    assert ground.local[v, u] == pytest.approx([2.0, 0.0], abs=0.12)
-    assert ground.distance[v, u] == pytest.approx(0.0, abs=0.12)
+    assert whole(ground, "local")[v, u] == pytest.approx([2.0, 0.0], abs=0.12)
+    assert distance()[v, u] == pytest.approx(0.0, abs=0.12)
     u, v = project(CAR.translation, CAMERA.matrix).round().long().tolist()
-    assert ground.distance[v, u] == pytest.approx(-0.85, abs=0.12)
-    assert np.isinf(ground.distance[:88]).all()
+    assert distance()[v, u] == pytest.approx(-0.85, abs=0.12)
+    assert np.isinf(distance()[:88]).all()
 
 
 @pytest.mark.parametrize("place", [(0.5, 1.65, 9.0), (-2.5, 1.65, 2.0), (4.0, 1.65, 40.0)])
@@ -73,10 +85,7 @@ def test_ground_view_holds_all_ground_within_metres_of_the_footprint(place: tupl
     x = (u - intrinsics[0, 2]) * np.minimum(z, 1e3) / intrinsics[0, 0]
     near = (np.hypot(x - place[0], z - place[2]) < 5.0) & (z > 0)
     assert near.any()
-    assert np.isfinite(ground.distance[near]).all()
-    beyond = np.ones_like(near)
-    beyond[ground.window] = False
-    assert np.isinf(ground.distance[beyond]).all()
+    assert np.isfinite(whole(ground, "distance")[near]).all()
 
 
 def found_in(
@@ -86,15 +95,17 @@ def found_in(
     pixels: np.ndarray | None = None,
 ) -> np.ndarray:
     """The car's shadow when the sun is known."""
-    cast = shadow.cast_box_shadow(CAR, view(), sun)
-    return shadow.find_shadows(light, vehicle() if pixels is None else pixels, [view()], [allowed], [cast])[0][0]
+    ground, pixels = view(), vehicle() if pixels is None else pixels
+    cast = shadow.cast_box_shadow(CAR, ground, sun)
+    found = shadow.find_shadows(light, pixels, [ground], [allowed[ground.window]], [cast])[0][0]
+    return ground.in_frame(found, allowed.shape)
 
 
 def test_a_shadow_is_found_and_the_lit_road_is_not():
     image, factor = shaded(toward(0.6, 0.0))
     light = lit_ground(image)
     found = found_in(light, toward(0.6, 0.0))
-    visible = ~vehicle() & (view().distance < 2.4)
+    visible = ~vehicle() & (distance() < 2.4)
     assert found[visible & (factor < 0.5)].mean() > 0.95
     assert found[visible & (factor > 0.95)].mean() < 0.02
     assert not (found & vehicle()).any()
@@ -106,7 +117,7 @@ def test_shade_that_goes_on_beyond_a_cars_reach_is_not_its_shadow():
     image[92:110] *= 2.5
     light = lit_ground(np.clip(image, 0, 1))
     found = found_in(light, toward(0.0, 0.0))
-    shade = (view().distance > 1.2) & (view().distance < 2.0) & ~vehicle()
+    shade = (distance() > 1.2) & (distance() < 2.0) & ~vehicle()
     shade[:, 250:] = False
     assert found[shade].mean() < 0.15
 
@@ -142,7 +153,7 @@ def test_a_low_suns_shadow_is_found_to_its_end():
     azimuths = [float(torch.atan2(s[2], s[0])) for s in (estimate, sun)]
     assert abs(np.remainder(azimuths[0] - azimuths[1] + np.pi, 2 * np.pi) - np.pi) < 0.2
     found = found_in(light, sun)
-    far = (factor < 0.75) & ~vehicle() & (view().distance > 1.3)
+    far = (factor < 0.75) & ~vehicle() & (distance() > 1.3)
     assert np.count_nonzero(far) > 200
     assert found[far].mean() > 0.9
 
@@ -167,7 +178,17 @@ def test_the_cast_is_the_renderers_and_ends_where_its_patch_does():
     cast, (_, factor) = shadow.cast_box_shadow(CAR, view(), sun), shaded(sun)
     inside = shadow.reachable_ground(CAR, view(), sun)
     assert not cast[~inside].any()
-    assert cast[inside] == pytest.approx((1 - factor[inside]) / 0.8, abs=1e-4)
+    assert cast[inside] == pytest.approx((1 - factor[view().window][inside]) / 0.8, abs=1e-4)
+
+
+def test_of_two_vehicles_the_nearer_one_owns_the_ground():
+    other = silhouette.place_mesh("hatchback", torch.tensor([4.5, 1.65, 9.0]), torch.tensor(0.4), CAR.size_lhw)
+    views = [view(), shadow.view_ground(other, LEVEL, CAMERA)]
+    owner, nearest = shadow.nearest_views(views, (200, 480))
+    distances = np.stack([whole(ground, "distance") for ground in views])
+    assert np.array_equal(owner, distances.argmin(0))
+    assert np.array_equal(nearest, distances.min(0))
+    assert 0 < owner.mean() < 1
 
 
 def test_factors_darken_only_in_their_region():
@@ -184,12 +205,12 @@ def test_factors_darken_only_in_their_region():
 
 def test_a_dark_strip_of_road_is_no_shadow_with_the_street_continued():
     image, factor = shaded(toward(0.6, 0.0))
-    strip = np.where(np.abs(view().local[..., 0] - 2.5) < 0.4, 0.6, 1.0).astype(np.float32)
+    strip = np.where(np.abs(whole(view(), "local")[..., 0] - 2.5) < 0.4, 0.6, 1.0).astype(np.float32)
     empty = np.full_like(image, 0.6) * strip[..., None]
     photograph = np.where(vehicle()[..., None], image, image * strip[..., None])
     smooth = lit_ground(photograph)
     continued = shadow.estimate_ground_light(photograph, vehicle(), [view()], lambda _: empty)
-    dark = (strip < 1) & (factor > 0.98) & ~vehicle() & (view().distance < 2.4)
+    dark = (strip < 1) & (factor > 0.98) & ~vehicle() & (distance() < 2.4)
     assert np.count_nonzero(dark) > 50
     wrong, right = (found_in(light, toward(0.6, 0.0)) for light in (smooth, continued))
     assert right[dark].mean() < 0.1 < wrong[dark].mean()
