@@ -166,7 +166,8 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     # Maps and depth of the background.
     if cuts:
         # The frame's classes do not cover what stands behind the vehicles.
-        behind = segmentation.segment_photograph(background, ground, camera, settings.segmenter, settings.shrink)
+        shrink = 2 * settings.shrink  # what stands behind is a guess
+        behind = segmentation.segment_photograph(background, ground, camera, settings.segmenter, shrink)
         filled = channel_max(np.abs(background - image)) > 0
         maps = segmentation.apply_frame_classes(frame, behind).merge_inside(filled, behind).outside(ego_opacity)
     footprints = ground_geometry.draw_footprints(labels, _posed_rows(labels), ground, camera)

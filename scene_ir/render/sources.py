@@ -164,33 +164,50 @@ def _solve_scene(
     blank = _estimate_lighting(scene, blank, mattes, lit, [behind_nearer[i] for i in range(count)], settings)
     solved: dict[int, Source] = {}
     front = list(scene.occluders)
-    for place, i in enumerate(order):
-        nearer = torch.zeros(frame_hw, dtype=torch.bool)
-        for j in order[place + 1 :]:
-            _crop_view(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
-        if i >= count:
-            bare = replace(mattes[i], values=torch.zeros_like(mattes[i].values))
-            standing = _solve_foreground(mattes[i], image, canvas, nearer, bare)
-            behind = _crop_view(canvas, standing)
-            behind.copy_(standing.values[:3] + (1.0 - standing.values[3:]) * behind)
-            front[i - count] = replace(front[i - count], foreground=standing)
-            continue
-        packed, size = drawn.mesh.layout.spans()[i]
-        x0, y0 = drawn.mesh.layout.rects[i, :2].tolist()
-        coverage = Crop(drawn.coverage[packed].reshape(1, *size), x0, y0)
-        foreground = _solve_foreground(mattes[i], image, canvas, nearer, coverage)
-        source = replace(blank[i], foreground=foreground, shadow=lit[i])
-        solved[i] = source
-        rect = drawn.mesh.layout.rects[i].tolist()
-        if not any(_touches(rect, mattes[j]) for j in order[place + 1 :]):
-            continue  # no later object is solved against it
-        one = replace(
-            scene, background=canvas, objects=replace(_select_object(objects, i), source=(source,)), occluders=()
-        )
-        alone = Compositor(one, RenderSettings(settings.backend), hidden=[behind_nearer[i]])
-        canvas = _composite_object(alone)
+    rects = [drawn.mesh.layout.rects[i].tolist() if i < count else _crop_rect(mattes[i]) for i in range(len(mattes))]
+    for level in _layer_levels(order, rects, mattes):
+        shown: list[int] = []
+        for i in level:
+            nearer = torch.zeros(frame_hw, dtype=torch.bool)
+            later = order[order.index(i) + 1 :]
+            for j in later:
+                _crop_view(nearer[None], mattes[j])[0] |= mattes[j].values[0] > 0
+            if i >= count:
+                bare = replace(mattes[i], values=torch.zeros_like(mattes[i].values))
+                standing = _solve_foreground(mattes[i], image, canvas, nearer, bare)
+                behind = _crop_view(canvas, standing)
+                behind.copy_(standing.values[:3] + (1.0 - standing.values[3:]) * behind)
+                front[i - count] = replace(front[i - count], foreground=standing)
+                continue
+            packed, size = drawn.mesh.layout.spans()[i]
+            coverage = Crop(drawn.coverage[packed].reshape(1, *size), *rects[i][:2])
+            foreground = _solve_foreground(mattes[i], image, canvas, nearer, coverage)
+            solved[i] = replace(blank[i], foreground=foreground, shadow=lit[i])
+            if any(_touches(rects[i], mattes[j]) for j in later):  # one of them is solved against it
+                shown.append(i)
+        if shown:
+            some = replace(_select_objects(objects, shown), source=tuple(solved[i] for i in shown))
+            part = replace(scene, background=canvas, objects=some, occluders=())
+            hidden = [behind_nearer[i] for i in shown]
+            canvas = _composite_objects(Compositor(part, RenderSettings(settings.backend), hidden=hidden))
     sources = tuple(solved[i] for i in range(count))
     return replace(scene, background=background, objects=replace(objects, source=sources), occluders=tuple(front))
+
+
+def _layer_levels(order: Sequence[int], rects: Sequence[list[int]], mattes: Sequence[Crop]) -> list[list[int]]:
+    """Objects and occluders, far ones first, in levels: those of one level do not touch each other, and each is
+    nearer than those of earlier levels that it touches.
+    """
+    levels: list[list[int]] = []
+    level_of: dict[int, int] = {}
+    for place, i in enumerate(order):
+        touched = (
+            level_of[j] + 1 for j in order[:place] if _touches(rects[j], mattes[i]) or _overlap(rects[j], rects[i])
+        )
+        level_of[i] = max(touched, default=0)
+        levels += [[] for _ in range(level_of[i] + 1 - len(levels))]
+        levels[level_of[i]].append(i)
+    return levels
 
 
 def _unsolved_source(
@@ -232,13 +249,13 @@ def _estimate_lighting(
     return [replace(s, paint=paint[i], sunlight=strength) for i, s in enumerate(blank)]
 
 
-def _select_object(objects: Objects, index: int) -> Objects:
-    """Object `index` alone, without source."""
+def _select_objects(objects: Objects, rows: Sequence[int]) -> Objects:
+    """Some objects, without sources."""
     names = (
         "mesh_index", "translation", "yaw", "size_lhw", "ffd", "texture_code", "category", "box2d", "truncation",
         "occlusion", "lamps",
     )  # fmt: skip
-    return replace(objects, source=(), **{n: getattr(objects, n)[index : index + 1] for n in names})
+    return replace(objects, source=(), **{n: getattr(objects, n)[list(rows)] for n in names})
 
 
 def _crop_view(frame: Tensor, crop: Crop) -> Tensor:
@@ -247,11 +264,21 @@ def _crop_view(frame: Tensor, crop: Crop) -> Tensor:
     return frame[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
 
 
+def _crop_rect(crop: Crop) -> list[int]:
+    """Rectangle x0, y0, x1, y1, half-open, of a crop."""
+    h, w = crop.values.shape[1:]
+    return [crop.x0, crop.y0, crop.x0 + w, crop.y0 + h]
+
+
 def _touches(rect: Sequence[int], matte: Crop) -> bool:
     """Whether a matte has pixels in a rectangle x0, y0, x1, y1, half-open, or adjacent to it."""
-    h, w = matte.values.shape[1:]
-    across = matte.x0 <= rect[2] and rect[0] <= matte.x0 + w
-    return bool(h and w) and across and matte.y0 <= rect[3] and rect[1] <= matte.y0 + h
+    return matte.values.numel() > 0 and _overlap(rect, _crop_rect(matte))
+
+
+def _overlap(first: Sequence[int], second: Sequence[int]) -> bool:
+    """Whether two rectangles x0, y0, x1, y1, half-open, overlap or are adjacent."""
+    across = second[0] <= first[2] and first[0] <= second[2]
+    return across and second[1] <= first[3] and first[1] <= second[3]
 
 
 def _cut_matte(alpha: Crop, drawn: VisibleSurfaces, nearest: Tensor, index: int, like: Tensor) -> Crop:
@@ -419,11 +446,11 @@ def _sunlight_from_shadow(shadow: Crop | None, sun: Tensor) -> float | None:
     return (_OPEN * level / max(left, 0.05) - level) / max(-float(sun[1]), 0.3)
 
 
-def _composite_object(alone: Compositor) -> Tensor:
-    """The background of a scene of one object with that object laid over it, without its shadow."""
-    objects, background = alone.scene.objects, alone.scene.background
-    layers = alone.draw_layers(objects)
+def _composite_objects(part: Compositor) -> Tensor:
+    """The background of a scene with its objects laid over it, without their shadows."""
+    objects, background = part.scene.objects, part.scene.background
+    layers = part.draw_layers(objects)
     no_shadow = PixelLayout.from_rects(layers.shadow_layout.rects * 0)
     plan = blend.BlendPlan.from_layouts(layers.layout, no_shadow, range(len(objects)))
     layer_data = (layers.shadow[:0], layers.colour, layers.opacity, layers.depth)
-    return blend.composite(background, alone.scene.depth, layer_data, plan, False, alone.backend)[0]
+    return blend.composite(background, part.scene.depth, layer_data, plan, False, part.backend)[0]
