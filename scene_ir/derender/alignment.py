@@ -62,7 +62,7 @@ class BoxAlignmentSettings:
 
 def align_to_boxes(
     placements: Sequence[Placement],
-    boxes: LabelBoxes,
+    boxes: LabelBoxes | None,
     camera: Camera,
     settings: BoxAlignmentSettings | None = None,
 ) -> list[Placement]:
@@ -72,7 +72,7 @@ def align_to_boxes(
 
     Args:
         placements: N meshes at their labels.
-        boxes: The N labels' 2D boxes.
+        boxes: The N labels' 2D boxes; None if their sides cannot be trusted, which moves nothing.
         camera: The photograph's camera.
         settings: Standard deviations and bounds.
 
@@ -80,6 +80,8 @@ def align_to_boxes(
         N placements.
     """
     settings = settings or BoxAlignmentSettings()
+    if boxes is None:
+        return list(placements)
     aligned = []
     for placement, box, trust in zip(placements, boxes.xyxy, boxes.trust, strict=True):
         shape = _mesh_shape(SameMesh(placement.mesh))
@@ -257,10 +259,8 @@ def choose_pose(
     """
 
     def align(placements: list[Placement], settings: BoxAlignmentSettings | None) -> list[Placement]:
-        if box is None:
-            return placements
         count = len(placements)
-        boxes = LabelBoxes(box.xyxy.expand(count, 4), box.trust.expand(count, 4))
+        boxes = None if box is None else LabelBoxes(box.xyxy.expand(count, 4), box.trust.expand(count, 4))
         return align_to_boxes(placements, boxes, photograph.camera, settings)
 
     aligned = align(list(options), _FIXED_POSE if measured else None)

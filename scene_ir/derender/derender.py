@@ -74,6 +74,8 @@ class DerenderSettings:
     """Fit templates to the masks; otherwise they stay at their labels."""
     min_height_px: float = 12.0
     """Lower vehicles stay in the background, px."""
+    min_fit_px: float = 25.0
+    """Vehicles with a lower 2D box, px, are placed by it and not fitted: they are too low to be evaluated."""
     min_iou: float = 0.6
     """Agreement of mask and template below which the template's outline is the mask."""
     max_inflation: float = 0.12
@@ -328,16 +330,21 @@ def _cut_out_vehicles(
     segmenter = _VehicleSegmenter(picture, frame, ground, settings)
     boxes = _trusted_boxes(labels, rows, camera)
     fills_box = {row: int(np.count_nonzero(boxes.trust[i])) >= 2 for i, row in enumerate(rows)}
+    heights = (labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]).tolist()
+    fitted_rows = {row for row in order if settings.fit and heights[row] >= settings.min_fit_px}
     drafts: list[_DraftCutout] = []
     for row in order:
         hidden = occluded[row] | _union([draft.mask for draft in drafts], shape)
         box = boxes.select(rows.index(row)) if fills_box[row] else None
         photograph = template_choice.ObjectPhotograph(picture, hidden, camera, settings.backend)
-        draft = _draft_cutout(row, frame, box, photograph, segmenter)
+        draft = _draft_cutout(row, frame, box, photograph, segmenter, row in fitted_rows)
         if draft is not None:
             drafts.append(draft)
-    if settings.fit and not settings.known_placements:
-        drafts = _fit_drafts(drafts, picture, _trusted_boxes(labels, [d.row for d in drafts], camera), segmenter)
+    if not settings.known_placements:
+        tall = [draft for draft in drafts if draft.row in fitted_rows]
+        tall = _fit_drafts(tall, picture, _trusted_boxes(labels, [d.row for d in tall], camera), segmenter)
+        drafts = [*tall, *(draft for draft in drafts if draft.row not in fitted_rows)]
+        drafts.sort(key=lambda draft: order.index(draft.row))
     cuts: list[_VehicleCutout] = []
     for draft in drafts:
         hidden = occluded[draft.row] | _union([cut.mask for cut in cuts], shape)
@@ -371,12 +378,17 @@ def _draft_cutout(
     box: LabelBoxes | None,
     photograph: template_choice.ObjectPhotograph,
     segmenter: _VehicleSegmenter,
+    is_fitted: bool,
 ) -> _DraftCutout | None:
-    """Choose a label's template and cut it out; None if nothing of it is visible."""
+    """Choose a label's template and cut it out; None if nothing of it is visible. One that is not fitted later has
+    the likeliest template by its label's proportions.
+    """
     settings, hidden = segmenter.settings, photograph.hidden
     options, measured = _candidate_placements(frame, row, settings)
     if settings.known_placements and settings.known_placements[row] is not None:
         costs = np.zeros(1)
+    elif settings.fit and not is_fitted:
+        options, costs = template_choice.align_to_boxes(options[:1], box, frame.camera), np.zeros(1)
     else:
         options, costs = template_choice.choose_pose(options, box, photograph, measured)
     outlines = silhouette.render_silhouettes(options, frame.camera, settings.backend)
@@ -393,7 +405,7 @@ def _draft_cutout(
         return None
     anchored = measured or photograph.visible_share(options[best]) < template_choice.MIN_VISIBLE_SHARE
     # Without a fit the template stays where the first cut-out had it.
-    reused = None if settings.fit or best != likeliest else first
+    reused = None if is_fitted or best != likeliest else first
     return _DraftCutout(row, options[best], mask, hidden, outlines[best], anchored, reused)
 
 
