@@ -28,7 +28,6 @@ from torch import Tensor
 
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
-from scene_ir.meshes.load import load_mesh, save_mesh
 from scene_ir.types import (
     FOLIAGE_DIM,
     LATTICE_POINTS,
@@ -162,6 +161,8 @@ def save_scene(scene: SceneIR, folder: Path, lossy: bool = False) -> None:
             arrays[_SAME] = _write_lossy_images(scene, temporary)
         files.write_npz(temporary / "arrays.npz", arrays, compressed=not lossy)
         (temporary / "meshes").mkdir()
+        from scene_ir.meshes.load import save_mesh
+
         for i, mesh in enumerate(scene.meshes):
             _check_mesh(i, mesh)
             save_mesh(mesh, temporary / "meshes" / f"{i}.glb")
@@ -558,6 +559,8 @@ def _load_occluder(index: int, node: _JsonNode, arrays: _NpzArrays) -> Occluder:
 
 
 def _load_mesh(path: Path) -> Mesh:
+    from scene_ir.meshes.load import load_mesh
+
     return _JsonNode(str(path), None).build(lambda: load_mesh(path))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -19,15 +19,6 @@ from detectors.base import Detector, DetectorError, Predictor, detector_device, 
 from detectors.check import survey_streets
 from detectors.registry import load_detector, load_predictor
 from drivesem.attacks.budgets import format_budget, parse_budget, resolve_parameters
-from drivesem.attacks.changes import (
-    SAMPLES,
-    VehicleChangeSettings,
-    count_affordable_proposals,
-    load_vehicle_mesh,
-    parse_vehicle_changes,
-    proposal_passes,
-    propose_scenes,
-)
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.methods.base import GRADIENT_PASSES, MAX_RESCORED, Attack, AttackResult, Problem
 from drivesem.attacks.methods.gradient_ascent import APGD, FGSM, SGD, SiFGSM
@@ -53,7 +44,6 @@ from drivesem.failures.certificate import CertificateRule
 from drivesem.failures.grading import Grader, make_reference_detector
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
-from drivesem.failures.second_renderer.selection import SecondRenderers
 from drivesem.reporting.tables import format_count
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from drivesem.run.finished import MANIFEST, METRICS, AttackRun, build_manifest, hash_json, load_runs
@@ -68,6 +58,11 @@ from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import SceneIR, convert_scene
+
+if TYPE_CHECKING:
+    from drivesem.attacks.changes import VehicleChangeSettings
+    from drivesem.failures.second_renderer.base import SecondRenderer
+    from drivesem.failures.second_renderer.selection import SecondRenderers
 
 SECOND_DETECTORS = ("yolov3-slim", "squeezedet")
 """Shipped detectors of different architectures; the one not under attack re-tests confirmed failures."""
@@ -288,6 +283,8 @@ class AttackInstance:
 
     def held_out_margin(self, theta: Tensor) -> float:
         """Mean margin at theta (D,) over held-out nuisance samples, as a margin search measures it."""
+        from drivesem.attacks.changes import SAMPLES
+
         oracle = self.margin_oracle
         samples = (oracle.margins(theta, FIRST_HELD_OUT_SAMPLE + sample) for sample in range(SAMPLES))
         return sum(margin_objective(margins, oracle.counted_objects) for margins in samples)
@@ -417,6 +414,8 @@ class AttackWorker:
         Returns:
             The scene with the lowest margins, the result on it, and the passes that the other scenes took.
         """
+        from drivesem.attacks.changes import count_affordable_proposals, proposal_passes, propose_scenes
+
         config, attack = self.config, self.method
         assert isinstance(attack, MarginSearch)
         count = count_affordable_proposals(attack.passes)
@@ -454,6 +453,8 @@ def _parse_changes(config: AttackConfig) -> VehicleChangeSettings | None:
     """The vehicle changes that the settings allow. Raises FormatError for an unknown change or a bad mesh."""
     if config.changes is None:
         return None
+    from drivesem.attacks.changes import VehicleChangeSettings, load_vehicle_mesh, parse_vehicle_changes
+
     mesh = None if config.mesh is None else load_vehicle_mesh(config.mesh)
     return VehicleChangeSettings(parse_vehicle_changes(config.changes), mesh)
 
@@ -508,12 +509,24 @@ def build_grader(config: AttackConfig, detector: Predictor) -> Grader:
         nuisances=Nuisances.parse(config.nuisances),
         rule=CertificateRule(config.draws),
         seed=config.seed,
-        make_second_renderer=SecondRenderers(config.dataset, config.root).renderer_for if config.confirm else None,
+        make_second_renderer=_second_renderer_maker(config) if config.confirm else None,
         load_second_detector=_second_detector_loader(config),
         reference_detector=None
         if config.reference_detector is None
         else _load_reference(config, config.reference_detector),
     )
+
+
+def _second_renderer_maker(config: AttackConfig) -> Callable[[str, SceneIR], SecondRenderer]:
+    """Makes the second renderer of a frame; its modules load with the first failure to confirm."""
+
+    @cache
+    def renderers() -> SecondRenderers:
+        from drivesem.failures.second_renderer.selection import SecondRenderers
+
+        return SecondRenderers(config.dataset, config.root)
+
+    return lambda identifier, scene: renderers().renderer_for(identifier, scene)
 
 
 def _second_detector_loader(config: AttackConfig) -> Callable[[], Predictor] | None:

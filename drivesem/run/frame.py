@@ -35,7 +35,6 @@ from drivesem.run.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, VehicleCounts, dump_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
-from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene, save_scene, to_uint8
 from scene_ir.types import Render, SceneIR
 
@@ -87,6 +86,11 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
     names = objective.classes.names
     scene = objective.space.scene
     moved = rendered.moved.targets
+    change = ""
+    if scene.before is not None:
+        from scene_ir.exchange import CHANGE_KEY
+
+        change = scene.provenance.get(CHANGE_KEY, "")
     return FrameResult(
         identifier=attacked.identifier,
         objects=len(scene.objects),
@@ -123,7 +127,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         grade_notes=attacked.grade_notes,
         min_contrast=objective.difficulty.min_contrast,
         joint_weather=True,
-        change=scene.provenance.get(CHANGE_KEY, "") if scene.before is not None else "",
+        change=change,
     )
 
 

@@ -313,7 +313,11 @@ def open_source(config: SceneOptions) -> SceneSource:
 
 def compile_source_kernels(config: SceneOptions) -> None:
     """Compile or load all kernels of a source's frames at once, before the first frame."""
-    from drivesem.synth import kernels, mesh_kernels
     from scene_ir.render import fast
 
-    fast.compile_kernels((kernels, mesh_kernels) if config.dataset == DEMO else ())
+    if config.dataset != DEMO:
+        fast.compile_kernels(())
+        return
+    from drivesem.synth import kernels, mesh_kernels
+
+    fast.compile_kernels((kernels, mesh_kernels))

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
-import kornia
 import numpy as np
 import torch
 from torch import Tensor
@@ -303,6 +302,8 @@ def apply_veil(image: Tensor, veil: Tensor, air: Tensor) -> Tensor:
 @lru_cache(maxsize=8)
 def _rain_streaks(height: int, width: int) -> Tensor:
     """Opacity (H, W) of the streaks of rain 1: sparse drops drawn out along a slight slant; constant per frame size."""
+    import kornia
+
     generator = torch.Generator().manual_seed(20190416)
     drops = (torch.rand(height, width, generator=generator) > 0.9965).float()
     length = max(5, height // 24)
@@ -348,6 +349,8 @@ def _flakes(height: int, width: int) -> Tensor:
 @lru_cache(maxsize=8)
 def _leaf_gaps(height: int, width: int) -> Tensor:
     """Gaps (H, W) in [0, 1] of thin foliage: band-limited noise of a few pixels; constant per frame size."""
+    import kornia
+
     generator = torch.Generator().manual_seed(19240901)
     noise = torch.rand(1, 1, height, width, generator=generator)
     fine = kornia.filters.gaussian_blur2d(noise, (5, 5), (1.0, 1.0), border_type="replicate")

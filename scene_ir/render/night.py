@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
-import kornia
 import numpy as np
 import torch
 from torch import Tensor
@@ -252,6 +251,8 @@ def _ramp(values: np.ndarray, low: float, high: float) -> np.ndarray:
 @lru_cache(maxsize=8)
 def _noise_field(height: int, width: int) -> Tensor:
     """Noise (3, H, W) of a camera, of standard deviation 1, mostly of brightness; constant per frame size."""
+    import kornia
+
     generator = torch.Generator().manual_seed(19390101)
     grey, colour = (
         torch.randn(1, 1, height, width, generator=generator),

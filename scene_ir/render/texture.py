@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import cv2
-import kornia
 import numpy as np
 import torch
 from torch import Tensor
@@ -338,6 +337,8 @@ def _paint(rgb: Tensor, code: Tensor, height: Tensor, base_lightness: Tensor) ->
 
 def rgb_to_lab(rgb: Tensor) -> Tensor:
     """CIE L*a*b* (R, 3) of sRGB rows (R, 3)."""
+    import kornia
+
     return kornia.color.rgb_to_lab(rgb.T[None, :, :, None])[0, :, :, 0].T
 
 
@@ -354,6 +355,8 @@ def lab_to_soft_rgb(lab_rows: Tensor) -> Tensor:
 
 def lab_to_rgb(lab_rows: Tensor) -> Tensor:
     """sRGB rows (R, 3) of CIE L*a*b* rows (R, 3): the inverse of `rgb_to_lab`, beyond [0, 1] out of gamut."""
+    import kornia
+
     return kornia.color.lab_to_rgb(lab_rows.T[None, :, :, None], clip=False)[0, :, :, 0].T
 
 

@@ -11,7 +11,6 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from scipy.linalg import hadamard
 from torch import Tensor
 
 from drivesem.attacks.methods.base import Attack, MarginOracle, Problem, Proposals, check_counts
@@ -235,6 +234,8 @@ def balanced_corners(owner: Tensor, count: int, generator: torch.Generator) -> T
     Returns:
         (count, K) bool.
     """
+    from scipy.linalg import hadamard
+
     owners = owner.unique().tolist()
     most = max(int((owner == one).sum()) for one in owners)
     size = 1 << max(count - 1, most).bit_length()
