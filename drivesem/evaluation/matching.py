@@ -89,9 +89,11 @@ class CandidatePairs:
         return self.ground_truth.ignore | (self.ground_truth.label == EVERY_CLASS)
 
     @cached_property
-    def _by_score(self) -> Integers:
-        """(N,) rows of detections by descending score, in file order for equal scores."""
-        return np.argsort(-self.detections.score, kind="stable")
+    def _by_score(self) -> dict[int, Integers]:
+        """Rows of each class's detections by descending score, in file order for equal scores."""
+        order = np.lexsort((-self.detections.score, self.detections.label))
+        classes, starts = np.unique(self.detections.label[order], return_index=True)
+        return dict(zip(classes.tolist(), np.split(order, starts[1:]), strict=True)) if len(order) else {}
 
     @cached_property
     def _clusters(self) -> tuple[OverlapPairs, Integers]:
@@ -189,7 +191,7 @@ class CandidatePairs:
         wanted = (truths.label == label) & ~truths.ignore
         if counted is not None:
             wanted &= counted
-        rows = self._by_score[detections.label[self._by_score] == label]
+        rows = self._by_score.get(label, np.zeros(0, np.int64))
         matched = match.ground_truth[rows]
         hit = np.append(wanted, False)[matched]  # UNMATCHED is the last
         misfire = (matched == UNMATCHED) & ~match.excused[rows]
