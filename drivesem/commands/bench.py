@@ -91,7 +91,8 @@ def _night(config: BenchConfig, console: Console) -> BenchResult:
     time_frame = night.build_frame_timer(settings)
     names, skipped, failed = select_frames(open_source(settings), settings)
     count = config.count or len(names)
-    chosen = night.pick_evenly(names, config.limit or night.FRAMES)
+    vehicles = night.count_labelled_vehicles(settings, names)
+    chosen = night.pick_evenly(names, config.limit or night.FRAMES, vehicles)
     attack = night.format_attack(settings)
     console.print(f"timing: {attack}", soft_wrap=True)
     console.print(
@@ -102,7 +103,7 @@ def _night(config: BenchConfig, console: Console) -> BenchResult:
     times = [time for time in timed.results.values() if time is not None]
     night.require_frames(times)
     processes = min(config.processes, len(chosen))
-    parts, nights = night.part_rows(times), night.night_rows(times, count, processes, config.seed)
+    parts, nights = night.part_rows(times, processes), night.night_rows(times, count, processes, config.seed)
     fields = {
         "attack": attack,
         "parts": parts,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
 from drivesem.attacks.feasible.vehicles import (
@@ -523,8 +524,6 @@ class WeatherSet:
         """The point of the set nearest to codes (4,), (5,) or (6,), exactly: the distance to a polyhedron by
         non-negative least squares (Lawson and Hanson 1974, chapter 23).
         """
-        from scipy.optimize import nnls
-
         axes = np.eye(len(codes))
         rows = np.concatenate([-self._sums, axes, -axes])
         offsets = np.concatenate([-self._room, self._lower, -self._upper]) - rows @ codes

@@ -17,10 +17,12 @@ FRAMES = [FrameTime(2.0, 4.0, 3.0, 1.0, 1.0), FrameTime(4.0, 8.0, 1.0, 1.0, 1.0)
 
 
 def test_where_the_time_goes() -> None:
-    rows = {row["part"]: row for row in night.part_rows(FRAMES)}
+    rows = {row["part"]: row for row in night.part_rows(FRAMES, 2)}
     assert [row["mean_s"] for row in rows.values()] == [3.0, 6.0, 2.0, 1.0]
     assert rows["search"]["share"] == pytest.approx(12 / 24)
     assert sum(row["share"] for row in rows.values()) == pytest.approx(1.0)
+    hourly = {part: row["frames_an_hour_without"] for part, row in rows.items()}
+    assert hourly == {"derender": 800, "search": 1200, "certify": 720, "write": 655}  # search pays most
 
 
 def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,6 +30,7 @@ def test_hours_of_many_frames_and_what_makes_them_fewer(monkeypatch: pytest.Monk
     first, *others = night.night_rows(FRAMES, 600, 2, 0)
     assert (first["how"], first["processes"], first["frames"]) == ("as configured", 2, 600)
     assert first["hours"] == pytest.approx(12 * 600 / 2 / 3600)
+    assert first["frames_an_hour"] == 600
     assert first["low"] <= first["hours"] <= first["high"]
     hours = {row["how"]: row["hours"] * 3600 * 2 / 600 for row in others}
     assert hours == pytest.approx(
@@ -64,9 +67,28 @@ def test_processor_time_estimates_an_idle_machine() -> None:
 
 def test_frames_lie_evenly() -> None:
     names = [f"{i:02d}" for i in range(11)]
-    assert night.pick_evenly(names, 3) == ["00", "05", "10"]
+    assert night.pick_evenly(names, 3) == ["01", "05", "09"]
     assert night.pick_evenly(names, 50) == names
     assert night.pick_evenly([], 3) == []
+
+
+def test_picked_frames_have_as_many_vehicles_as_all() -> None:
+    """Every third of these frames has one vehicle, the others up to twenty: places alone would see only the former."""
+    vehicles = [1 if i % 3 == 1 else i // 3 for i in range(60)]
+    names = [str(i) for i in range(60)]
+    picked = [vehicles[int(name)] for name in night.pick_evenly(names, 20, vehicles)]
+    assert sum(picked) / 20 == pytest.approx(sum(vehicles) / 60, rel=0.05)
+    assert night.pick_evenly(names, 60, vehicles) == names
+
+
+def test_vehicles_are_counted_in_labels(small_kitti: Path) -> None:
+    root = small_kitti / "training"
+    labels = (root / "label_2/000008.txt").read_text()
+    settings = night.build_attack_config(BenchConfig(what="night", dataset="kitti", root=str(small_kitti)))
+    count = sum(line.startswith(("Car ", "Van ", "Truck ")) for line in labels.splitlines())
+    assert night.count_labelled_vehicles(settings, ["000008"]) == [count]
+    assert count > 0
+    assert night.count_labelled_vehicles(night.build_attack_config(BenchConfig(what="night")), ["a"]) is None
 
 
 def test_no_frame_with_a_vehicle() -> None:
