@@ -49,7 +49,6 @@ from drivesem.data.label_table import (
     xyxy_to_coco,
 )
 from drivesem.data.photographs import (
-    PNG_COMPRESSION,
     FrameIndex,
     check_focal,
     pinhole_camera,
@@ -134,7 +133,7 @@ class CocoWriter:
             "camera": make_camera_entry(camera.matrix),
         }
         annotations = [*_object_annotations(exposure), *_region_annotations(exposure)]
-        files.write_png(self._image(location), exposure.image, PNG_COMPRESSION)
+        files.write_png(self._image(location), exposure.image)
         return {"number": location.number, "part": location.part, "image": record, "annotations": annotations}
 
     def finish(self, entries: Sequence[Mapping[str, Any]]) -> None:

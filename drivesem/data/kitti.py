@@ -49,7 +49,6 @@ from drivesem.data.label_table import (
     parse_camera_entry,
 )
 from drivesem.data.photographs import (
-    PNG_COMPRESSION,
     FrameIndex,
     check_image_size,
     is_in_front,
@@ -615,7 +614,7 @@ class KittiWriter:
                 ("depth_2", _depth_map(exposure.depth_cm)),
                 ("instance_2", _instance_map(exposure)),
             ):
-                files.write_png(self.folder / name / f"{identifier}.png", values, PNG_COMPRESSION)
+                files.write_png(self.folder / name / f"{identifier}.png", values)
         self.write_photograph(identifier, exposure.image, exposure.labels, exposure.camera.matrix)
         return {"number": location.number, "part": location.part}
 
@@ -630,7 +629,7 @@ class KittiWriter:
         """
         files.write_text(self.folder / "calib" / f"{identifier}.txt", format_calibration(projection))
         write_labels(self.folder / "label_2" / f"{identifier}.txt", labels)
-        files.write_png(self._image(identifier), image_rgb, PNG_COMPRESSION)
+        files.write_png(self._image(identifier), image_rgb)
 
     def finish(self, entries: Sequence[Mapping[str, object]]) -> None:
         """Write `ImageSets/{train,val,trainval}.txt`, one identifier per line, as KITTI's loaders read them."""

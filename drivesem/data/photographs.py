@@ -22,8 +22,6 @@ from scene_ir.types import Camera, Frame, Labels
 
 T = TypeVar("T")
 
-PNG_COMPRESSION = 1
-"""zlib level for images: several times as fast as the best compression."""
 BOX_MARGIN = 0.1
 """How far a label's box may reach beyond the image, in image sizes; beyond it, labels and image do not belong together.
 KITTI's never do (checked on all 7,481); other tools' may, since objects continue there."""

@@ -37,7 +37,6 @@ from drivesem.data.label_table import (
     xyxy_to_coco,
 )
 from drivesem.data.photographs import (
-    PNG_COMPRESSION,
     FrameIndex,
     check_focal,
     pinhole_camera,
@@ -91,7 +90,7 @@ class YoloWriter:
         ]
         files.write_text(self._path("calib", location, ".txt"), format_calibration(camera.matrix))
         files.write_text(self._path("labels", location, ".txt"), "".join(f"{line}\n" for line in lines))
-        files.write_png(self._path("images", location, ".png"), exposure.image, PNG_COMPRESSION)
+        files.write_png(self._path("images", location, ".png"), exposure.image)
         return {"number": location.number, "part": location.part}
 
     def finish(self, entries: Sequence[Mapping[str, Any]]) -> None:

@@ -8,6 +8,7 @@ bytes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -179,10 +180,15 @@ def masked_blur(values: Image, mask: Mask, sigma: float) -> Image:
     Returns:
         (H, W, 3).
     """
-    weight = mask.astype(np.float32)
+    x0, y0, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    reach = math.ceil(4 * sigma) + 1  # as far as OpenCV's kernel
+    part = slice(max(y0 - reach, 0), y0 + height + reach), slice(max(x0 - reach, 0), x0 + width + reach)
+    weight = mask[part].astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
-    mean = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigma) / np.maximum(total, 1e-3)[..., None]
-    return np.asarray(mean, np.float32)
+    mean = np.zeros(values.shape, np.float32)
+    coloured = values[part] * weight[..., None]
+    mean[part] = cv2.GaussianBlur(coloured, (0, 0), sigma) / np.maximum(total, 1e-3)[..., None]
+    return mean
 
 
 def mirror_sources(unknown: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

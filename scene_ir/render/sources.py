@@ -164,7 +164,9 @@ def _solve_scene(
     blank = _estimate_lighting(scene, blank, mattes, lit, [behind_nearer[i] for i in range(count)], settings)
     solved: dict[int, Source] = {}
     front = list(scene.occluders)
-    rects = [drawn.mesh.layout.rects[i].tolist() if i < count else _crop_rect(mattes[i]) for i in range(len(mattes))]
+    rects = [
+        drawn.mesh.layout.rects[i].tolist() if i < count else _crop_rect(mattes[i]) for i in range(len(mattes))
+    ]
     for level in _layer_levels(order, rects, mattes):
         shown: list[int] = []
         for i in level:

@@ -599,7 +599,7 @@ def shadow_density(local_xz: Tensor, size_lhw: Tensor, offset: Tensor) -> Tensor
         apart = (q.clamp(min=0.0).square().sum(-1) + 1e-6).sqrt()
         return apart + q.amax(dim=-1).clamp(max=0.0)
 
-    contact = _thread_invariant_sigmoid(-outside(torch.zeros_like(offset), half - 0.12) / 0.10)
+    contact = _thread_invariant_sigmoid(-outside(offset.new_zeros(2), half - 0.12) / 0.10)
     shares = ((0.25, 0.97), (0.55, 0.92), (0.9, 0.72))
     cast = torch.stack(
         [_thread_invariant_sigmoid(-outside(offset * s, half * taper) / (0.04 + 0.05 * s)) for s, taper in shares]

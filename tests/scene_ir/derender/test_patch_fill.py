@@ -1,9 +1,10 @@
 """Filling holes from the same photograph."""
 
+import cv2
 import numpy as np
 import pytest
 
-from scene_ir.derender.patch_fill import GroundMaps, PatchFillSettings, fill_patches, mirror_sources
+from scene_ir.derender.patch_fill import GroundMaps, PatchFillSettings, fill_patches, masked_blur, mirror_sources
 
 SHAPE = (72, 120)
 
@@ -114,3 +115,15 @@ def test_a_hole_with_hardly_a_pixel_to_copy_from_is_filled(side: int):
     assert np.array_equal(result[~hole()], image[~hole()])
     assert result.min() >= 0
     assert result.max() <= 1
+
+
+@pytest.mark.parametrize("sigma", [0.7, 6.0])
+def test_a_blur_within_a_mask_is_that_of_the_whole_picture(sigma: float):
+    rng = np.random.default_rng(2)
+    values, mask = rng.random((90, 140, 3), np.float32), np.zeros((90, 140), bool)
+    mask[10:20, 3:30] = rng.random((10, 27)) > 0.4
+    weight = mask.astype(np.float32)
+    total = np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3)[..., None]
+    whole = cv2.GaussianBlur(values * weight[..., None], (0, 0), sigma) / total
+    assert np.allclose(masked_blur(values, mask, sigma), whole, atol=1e-5)
+    assert not masked_blur(values, np.zeros_like(mask), sigma).any()
