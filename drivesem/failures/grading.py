@@ -139,13 +139,29 @@ class Grader:
     def certificates(self, case: GradingInput, faults: tuple[Fault, ...]) -> tuple[Certificate, ...]:
         """Certify faults on samples by the frame's own renderer."""
         camera = self._make_camera(case, case.renderer, self.detector, self.t_star)
+        outcomes: dict[int, SampleOutcome] = {}
+
+        def after(number: int) -> SampleOutcome:
+            if number not in outcomes:
+                outcomes.update(
+                    _evaluate_states(case.changed, case.now, camera, self._numbers_with(case, camera, number))
+                )
+            return outcomes[number]
+
         return certify(
             faults,
             _fault_boxes(case, faults),
             lambda number: self._evaluate_unchanged(case, camera, number),
-            lambda number: _evaluate_state(case.changed, case.now, camera, number),
+            after,
             self.rule,
         )
+
+    def _numbers_with(self, case: GradingInput, camera: NuisanceCamera, number: int) -> Sequence[int]:
+        """The samples to evaluate when one is wanted: all of a certificate where they are drawn together, else that
+        one, as early ones may decide.
+        """
+        together = camera.draws_together(case.base) and number < self.rule.draws
+        return range(self.rule.draws) if together else [number]
 
     def count_wrong(self, case: GradingInput, fault: Fault, draws: int, enough: int = 0) -> int:
         """Count the samples that show a fault after the change: the first of its certificate's, by the same rule.
@@ -162,7 +178,8 @@ class Grader:
         for number in range(draws):
             if wrong + draws - number < enough:
                 break
-            wrong += shows_fault(fault, place, _evaluate_state(case.changed, case.now, camera, number))
+            (outcome,) = _evaluate_states(case.changed, case.now, camera, [number]).values()
+            wrong += shows_fault(fault, place, outcome)
         return wrong
 
     def second_opinions(self, case: GradingInput, faults: Sequence[Fault]) -> dict[Fault, SecondOpinion]:
@@ -183,12 +200,12 @@ class Grader:
             return {}
         peer = self.load_second_detector()
         camera = self._make_camera(case, case.renderer, peer, resolve_t_star(peer), "peer")
-        before = [_evaluate_state(case.base, case.benign, camera, number) for number in _OPINION_SAMPLES]
+        before = [*_evaluate_states(case.base, case.benign, camera, _OPINION_SAMPLES).values()]
         opinions = _second_opinions(case, camera, faults, before, peer.name)
         agreeing = [fault for fault in faults if opinions[fault].agrees]
         if agreeing:
             edited = case.placebo()
-            samples = [_evaluate_state(edited, case.benign, camera, number) for number in _OPINION_SAMPLES]
+            samples = [*_evaluate_states(edited, case.benign, camera, _OPINION_SAMPLES).values()]
             for fault in agreeing:
                 opinions[fault] = replace(opinions[fault], placebo=_count_right(case, fault, samples))
         return opinions
@@ -202,7 +219,8 @@ class Grader:
             self._unchanged_outcomes = (labels, {})
         cache, key = self._unchanged_outcomes[1], (camera.stream, number)
         if key not in cache:
-            cache[key] = _evaluate_state(case.base, case.benign, camera, number)
+            found = _evaluate_states(case.base, case.benign, camera, self._numbers_with(case, camera, number))
+            cache.update({(camera.stream, one): outcome for one, outcome in found.items()})
         return cache[key]
 
     def _grade_faults(
@@ -245,11 +263,12 @@ class Grader:
         return NuisanceCamera(renderer, detector, t_star, self.nuisances, stream)
 
 
-def _evaluate_state(
-    state: SceneIR, labelled: LabelledDetections, camera: NuisanceCamera, number: int
-) -> SampleOutcome:
-    """Evaluate a sample of a state; `labelled` names the objects that are ignored in it."""
-    return camera.evaluate(state, number, labelled.targets.ignore[: len(state.objects)])
+def _evaluate_states(
+    state: SceneIR, labelled: LabelledDetections, camera: NuisanceCamera, numbers: Sequence[int]
+) -> dict[int, SampleOutcome]:
+    """Outcomes of a state's samples by number; `labelled` names the objects that are ignored in it."""
+    ignore = labelled.targets.ignore[: len(state.objects)]
+    return dict(zip(numbers, camera.evaluate_all(state, numbers, ignore), strict=True))
 
 
 def _second_opinions(
@@ -257,7 +276,7 @@ def _second_opinions(
 ) -> dict[Fault, SecondOpinion]:
     """Count how often faults occur with a camera. before: samples of the unchanged scene."""
     places = _fault_boxes(case, tuple(faults))
-    after = [_evaluate_state(case.changed, case.now, camera, number) for number in _OPINION_SAMPLES]
+    after = [*_evaluate_states(case.changed, case.now, camera, _OPINION_SAMPLES).values()]
     return {
         fault: SecondOpinion(
             name,

@@ -15,10 +15,16 @@ import torch
 
 from detectors.registry import load_detector
 from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.objective import Objective
 from drivesem.cli import main
+from drivesem.config.commands import AttackConfig
+from drivesem.failures.certificate import CompositorRenderer, NuisanceCamera, SampleOutcome
+from drivesem.failures.nuisances import Nuisances
 from drivesem.viewer.scene import InteractiveScene
+from scene_ir.io import load_scene
 from scene_ir.raster import launch
 from scene_ir.raster.kernels import unpack_kernel
+from scene_ir.types import convert_scene
 from tests.pretended_gpu import CPU, GPU, place, pretended
 
 ALL = "color,weather,foliage,translate,rotate,mesh"
@@ -133,6 +139,32 @@ def test_a_scene_is_rendered(tmp_path: Path) -> None:
         assert all((stage.encode_picture(drawn), stage.encode_photograph(), stage.encode_street()))
         assert stage.detect({}, drawn)["cars"]
         assert 0 < stage.score({}, 0, drawn)["score"] <= 1
+
+
+def test_samples_of_a_state_are_detected_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(["attack", "--combo", "1", "--steps", "1", "--no-grade", "--limit", "1"], tmp_path / "run", "cpu")
+    (folder,) = (tmp_path / "run").glob("frames/*/scene")
+
+    def outcomes(device: str) -> tuple[list[SampleOutcome], list[int]]:
+        detector, sizes = load_detector("squeezedet", device), list[int]()
+        state = convert_scene(load_scene(folder), None, device)
+        objective = Objective.from_config(state, detector, AttackConfig())
+        forward = detector.forward
+        monkeypatch.setattr(detector, "forward", lambda images: (sizes.append(len(images)), forward(images))[1])
+        renderer = CompositorRenderer(objective.compositor, objective.labeller)
+        camera = NuisanceCamera(renderer, detector, objective.t_star, Nuisances(), "test")
+        found = camera.evaluate_all(state, range(3), torch.zeros(len(state.objects), dtype=torch.bool))
+        return found, sizes
+
+    here, one_by_one = outcomes("cpu")
+    with pretended():
+        there, together = outcomes("cuda")
+    assert one_by_one == [1, 1, 1]
+    assert together == [3]
+    for mine, other in zip(here, there, strict=True):
+        found, expected = (one.labelled.detections for one in (other, mine))
+        np.testing.assert_allclose(np.asarray(found.scores.tolist()), expected.scores, atol=1e-3)
+        assert other.outcome.detected.tolist() == mine.outcome.detected.tolist()
 
 
 @pytest.mark.slow
