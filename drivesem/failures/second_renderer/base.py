@@ -11,6 +11,9 @@ from detectors.types import Targets
 from scene_ir.errors import SceneError
 from scene_ir.types import SceneIR
 
+MANIFEST = "manifest.json"
+"""File of a generated data set with its settings, by which the generator can draw its frames again."""
+
 
 @dataclass(frozen=True, slots=True)
 class SecondRender:

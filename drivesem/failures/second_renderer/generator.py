@@ -16,7 +16,7 @@ from detectors.types import CLASSES, Targets
 from drivesem.attacks.labels import Difficulty
 from drivesem.config.edits import FrameEdit, ObjectEdit
 from drivesem.config.errors import UsageError
-from drivesem.failures.second_renderer.base import SecondRender
+from drivesem.failures.second_renderer.base import MANIFEST, SecondRender
 from drivesem.synth.demo import demo_plan
 from drivesem.synth.edits import apply_edit
 from drivesem.synth.frames import (
@@ -38,7 +38,6 @@ from scene_ir.derender.derender import VEHICLE_CATEGORIES
 from scene_ir.errors import FormatError
 from scene_ir.types import LATTICE, SceneIR
 
-MANIFEST = "manifest.json"
 _GENERATED_RUN = "a run on generated frames: the embedded scenes, or drivesem synth --layout kitti"
 _EXTERNAL_FILES = ("edits", "meshes", "assets")
 """Files that a manifest names but that are not part of the data set."""

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from drivesem.config.errors import UsageError
 from drivesem.config.options import DEMO
-from drivesem.failures.second_renderer.base import SecondRender, SecondRenderer
-from drivesem.failures.second_renderer.generator import DemoPlans, FolderPlans, GeneratorRenderer, PlanSource
+from drivesem.failures.second_renderer.base import MANIFEST, SecondRender, SecondRenderer
 from drivesem.failures.second_renderer.opengl import shared_context
 from drivesem.failures.second_renderer.photograph import PhotographRenderer
 from drivesem.store import local_copy
 from scene_ir.errors import FormatError
 from scene_ir.types import SceneIR, convert_scene
+
+if TYPE_CHECKING:
+    from drivesem.failures.second_renderer.generator import PlanSource
 
 
 class ExchangedSceneRenderer:
@@ -97,17 +100,26 @@ class SecondRenderers:
             return CpuSecondRenderer(self._make_renderer(identifier, convert_scene(scene, None, "cpu")))
         if scene.before is not None:
             return ExchangedSceneRenderer(identifier, scene)
-        plans = DemoPlans() if scene.provenance.get("dataset") == DEMO else self._folder
-        if plans is not None:
-            return GeneratorRenderer(identifier, scene, plans)
-        return PhotographRenderer(identifier, scene)
+        is_demo = scene.provenance.get("dataset") == DEMO
+        if self._folder is None and not is_demo:
+            return PhotographRenderer(identifier, scene)
+        from drivesem.failures.second_renderer.generator import DemoPlans, GeneratorRenderer
+
+        plans = DemoPlans() if is_demo or self._folder is None else self._folder
+        return GeneratorRenderer(identifier, scene, plans)
 
 
 def _find_folder_plans(dataset: str, root: str | None) -> PlanSource | None:
     """Plans of a folder that the generator wrote; None for other folders, and for those without their settings."""
     if dataset != "kitti":
         return None
+    folder = local_copy(root or "")
+    if not any((one / MANIFEST).is_file() for one in (folder, folder.parent)):
+        return None
+    # Photographs need no generator, which takes a second to load.
+    from drivesem.failures.second_renderer.generator import FolderPlans
+
     try:
-        return FolderPlans(local_copy(root or ""))
+        return FolderPlans(folder)
     except (UsageError, FormatError):
         return None

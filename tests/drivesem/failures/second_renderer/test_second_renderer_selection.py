@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,6 +46,19 @@ def test_photographs_go_to_pyrender(screen: OpenGLContext, tmp_path: Path) -> No
     second = SecondRenderers("kitti", str(tmp_path))
     second.check()
     assert isinstance(second.renderer_for("000000", photograph), PhotographRenderer)
+
+
+def test_photographs_do_not_load_the_generator(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "from drivesem.failures.second_renderer.selection import SecondRenderers\n"
+        f"assert not SecondRenderers('kitti', {str(tmp_path)!r}).generated\n"
+        "print('drivesem.synth.frames' in sys.modules)\n"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        == "False\n"
+    )
 
 
 def test_attacks_on_one_scene_share_the_renderer() -> None:
