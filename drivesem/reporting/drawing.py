@@ -185,9 +185,11 @@ class LabelLayout:
             )
 
         extent = measure_text(label.text, label.size_px)
-        self.placed.append(
-            (min(_candidate_positions(xyxy, extent, self.size_wh, within), key=count_overlaps), label)
-        )
+        counted = ((count_overlaps(s), s) for s in _candidate_positions(xyxy, extent, self.size_wh, within))
+        best = next(counted)
+        while best[0] != (0, 0) and (other := next(counted, None)) is not None:
+            best = other if other[0] < best[0] else best
+        self.placed.append((best[1], label))
 
     def draw(self, canvas: np.ndarray) -> None:
         """Draw all labels into `canvas` (H, W, 3) uint8."""
