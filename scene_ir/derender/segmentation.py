@@ -205,7 +205,9 @@ def segment_photograph(
     elevation = cv2.resize(elevation, (width, height), interpolation=cv2.INTER_LINEAR)
     below = np.clip((_GROUND_ENDS - elevation) / _END_WIDTH, 0, 1)
     above = np.clip((elevation - _SKY_ENDS) / _END_WIDTH, 0, 1)
-    sky = _complete_sky(maps.sky, image) * above
+    end = int(np.flatnonzero(above.any(1)).max(initial=0)) + 1  # there is no sky below
+    sky = np.zeros_like(maps.sky)
+    sky[:end] = _complete_sky(maps.sky[:end], image[:end], max(3, height // 4)) * above[:end]
     return replace(
         maps,
         sky=sky,
@@ -215,11 +217,11 @@ def segment_photograph(
     )
 
 
-def _complete_sky(sky: Array, image: Array) -> Array:
-    """The map (H, W) of the sky with its gaps filled: the network is unsure of clouds around a pole, while what stands
-    before a sky is darker than it or has edges; and it misses a blue sky behind bare branches.
+def _complete_sky(sky: Array, image: Array, reach: int) -> Array:
+    """The map (H, W) of the sky with its gaps filled, by the sky within `reach` px: the network is unsure of clouds
+    around a pole, while what stands before a sky is darker than it or has edges; and it misses a blue sky behind bare
+    branches.
     """
-    reach = max(3, image.shape[0] // 4)
     luma = image @ np.array(LUMA, np.float32)
     sure = (sky > _SURE_SKY).astype(np.float32)
     weight = cv2.blur(sure, (reach, reach))

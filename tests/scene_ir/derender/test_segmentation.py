@@ -180,7 +180,7 @@ def test_the_sky_has_grey_clouds_and_gaps_between_branches_but_no_poles():
     sky[80:] = 0.0
     image[80:] = 0.4
     image[blue_wall] = (0.05, 0.1, 0.5)
-    found = segment._complete_sky(sky, image)
+    found = segment._complete_sky(sky, image, image.shape[0] // 4)
     assert found[15:35, 64:72].min() > 0.9
     assert found[12:70, 79:81].max() < 0.4
     assert found[53:58, 22:27].min() > 0.9
