@@ -6,8 +6,12 @@ elsewhere, NumPy's view of one. So whoever has no GPU finds what was forgotten w
 
 from __future__ import annotations
 
+import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -42,6 +46,51 @@ _MADE = (
 _ANY_INDEX = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 _COPIES = ("aten::copy_", "aten::_to_copy", "aten::_copy_from")
 _NO_SCALARS = ("aten::cat", "aten::stack")
+_WAITS = {f"aten::{name}" for name in ("equal", "nonzero", "masked_select", "bincount", "_unique2", "unique_dim")}
+"""What the processor waits for: it needs the value, or the size, of the result."""
+_NO_KERNEL = {f"aten::{name}" for name in ("empty", "empty_like", "new_empty", "empty_strided", "detach", "record")}
+_ROOT = f"{Path(__file__).parents[1]}/"
+
+
+@dataclass
+class GpuTraffic:
+    """What a GPU was asked to do, by the project's line that asked; of `pretended`."""
+
+    waits: Counter[str] = field(default_factory=Counter)
+    """The processor waited for it; with torch it does so for every copy that is not asynchronous."""
+    copies: Counter[str] = field(default_factory=Counter)
+    """Tensors and numbers copied to or from it."""
+    launches: Counter[str] = field(default_factory=Counter)
+    """Kernels of Warp."""
+    operations: Counter[str] = field(default_factory=Counter)
+    """Operations of torch with at least one kernel."""
+
+    def totals(self) -> dict[str, int]:
+        """Sums over all lines."""
+        return {entry.name: sum(getattr(self, entry.name).values()) for entry in fields(self)}
+
+    def clear(self) -> None:
+        """Start anew."""
+        for entry in fields(self):
+            getattr(self, entry.name).clear()
+
+
+_traffic = GpuTraffic()
+
+
+def _line() -> str:
+    frame = sys._getframe(1)
+    while frame is not None:
+        path = frame.f_code.co_filename.removeprefix(_ROOT)
+        if not path.startswith(("/", "tests", "<")):
+            return f"{path}:{frame.f_lineno}"
+        frame = frame.f_back
+    return "elsewhere"
+
+
+def _count_copy(waits: bool = True) -> None:
+    _traffic.copies[_line()] += 1
+    _traffic.waits[_line()] += waits
 
 
 def place(tensor: Tensor) -> torch.device:
@@ -65,7 +114,9 @@ class _Move(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, where: torch.device) -> Tensor:
         ctx.back = place(tensor)
-        moved = tensor.clone()
+        with torch.utils._python_dispatch._disable_current_modes():
+            moved = tensor.clone()
+        _count_copy()
         _put(moved, where)
         return moved
 
@@ -91,11 +142,24 @@ class _Operations(TorchDispatchMode):
         own = [t for t in given if t.ndim] or given
         first = own[0] if name in _ANY_INDEX or name in _COPIES else None
         where = place(first) if first is not None else GPU if there else CPU if given else _EITHER
-        known = {id(_storage(t)) for t in given}
+        known, computes = {id(_storage(t)) for t in given}, func._schema.is_mutable
         for leaf in tree_leaves(outcome):
             if isinstance(leaf, Tensor) and id(_storage(leaf)) not in known:
                 _put(leaf, where)
+                computes = True
+        if there:
+            self._count(name, given, computes)
         return outcome
+
+    def _count(self, name: str, given: list[Tensor], computes: bool) -> None:
+        if name == "aten::_local_scalar_dense":
+            _count_copy()
+        elif name in _WAITS or (name in _ANY_INDEX and any(t.dtype == torch.bool for t in given[1:])):
+            _traffic.waits[_line()] += 1
+        if name in _COPIES and len({place(t) for t in given}) > 1:
+            _count_copy()
+        elif computes and name not in _NO_KERNEL:
+            _traffic.operations[_line()] += 1
 
     def _check(self, name: str, given: list[Tensor]) -> None:
         if name in _ANY_INDEX:
@@ -117,6 +181,8 @@ class _Calls(TorchFunctionMode):
             return place(args[0]) == GPU
         if name in ("numpy", "__array__") and place(args[0]) == GPU:
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
+        if name == "tolist" and place(args[0]) == GPU:
+            _count_copy()
         if name == "cpu":
             return _moved(args[0], CPU)
         if name == "cuda":
@@ -135,6 +201,8 @@ class _Calls(TorchFunctionMode):
             return _moved(outcome, where)
         if isinstance(outcome, Tensor):
             _put(outcome, where)
+            if where == GPU and name in ("tensor", "new_tensor", "as_tensor"):
+                _count_copy()
         return outcome
 
     def _to(self, func: Any, args: Any, kwargs: dict[str, Any]) -> Tensor:
@@ -188,14 +256,16 @@ class _Kernels:
                     raise RuntimeError(f"{kernel.key}: an array lies on {place(tensor)}, the kernel on {where}")
         for value in arrays:
             value.device = launch.wp.get_device("cpu")
+        _traffic.launches[_line()] += where == GPU
         self._run(kernel, start, count, inputs, "cpu", None)
         for value in arrays:
             value.device = _WARPS_GPU
 
 
 @contextmanager
-def pretended() -> Iterator[None]:
-    """While it lasts, there is a GPU."""
+def pretended() -> Iterator[GpuTraffic]:
+    """While it lasts, there is a GPU; what it is asked to do is counted."""
+    _traffic.clear()
     kernels, to_torch, engine = _Kernels(), launch.wp.device_to_torch, torch.autograd._engine_run_backward
 
     def backward(*args: Any, **kwargs: Any) -> Any:
@@ -214,4 +284,4 @@ def pretended() -> Iterator[None]:
         patch.setattr(torch.cuda, "get_device_name", lambda *_: "pretended")
         patch.setattr(torch.autograd, "_engine_run_backward", backward)
         with _Calls(), _Operations():
-            yield
+            yield _traffic
