@@ -113,6 +113,15 @@ class AnchorPredictions:
         names = ("boxes_xyxy", "deltas", "class_logits", "confidence_logits")
         return replace(self, **{name: getattr(self, name)[index : index + 1] for name in names})
 
+    def to_host(self) -> AnchorPredictions:
+        """The predictions on the CPU, without gradients; from a GPU in one transfer."""
+        if not self.boxes_xyxy.is_cuda:
+            return self
+        parts = (self.boxes_xyxy, self.deltas, self.class_logits, self.confidence_logits[..., None])
+        moved = torch.cat([part.detach() for part in parts], -1).cpu()
+        boxes_xyxy, deltas, classes, confidence = moved.split([part.shape[-1] for part in parts], -1)
+        return AnchorPredictions(boxes_xyxy, deltas, classes, confidence[..., 0], self.image_hw)
+
     def inject(self, box_xyxy: Tensor, label: int) -> AnchorPredictions:
         """A copy with this box as the only confident prediction in each image, at the first anchor."""
         boxes, classes = self.boxes_xyxy.clone(), torch.full_like(self.class_logits, -CERTAIN)

@@ -69,8 +69,8 @@ def clip(boxes_xyxy: Tensor, height: int, width: int) -> Tensor:
         height: Of the image; y is clipped to [0, height - 1], KITTI's 0-based limits.
         width: Of the image; x is clipped to [0, width - 1].
     """
-    limit = boxes_xyxy.new_tensor([width - 1, height - 1, width - 1, height - 1])
-    return torch.minimum(boxes_xyxy.clamp_min(0), limit)
+    corners = boxes_xyxy[..., ::2].clamp(0, width - 1), boxes_xyxy[..., 1::2].clamp(0, height - 1)
+    return torch.stack(corners, -1).flatten(-2)
 
 
 def nms(boxes_xyxy: Tensor, scores: Tensor, iou_threshold: float, labels: Tensor | None = None) -> Tensor:

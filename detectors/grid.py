@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import torch
@@ -129,7 +130,7 @@ def decode_unit_boxes(deltas: Tensor) -> Tensor:
 
 def safe_exp(x: Tensor) -> Tensor:
     """exp up to EXP_THRESHOLD, then its tangent, so that untrained boxes cannot overflow."""
-    slope = torch.exp(x.new_tensor(EXP_THRESHOLD))
+    slope = math.exp(EXP_THRESHOLD)
     return torch.where(x > EXP_THRESHOLD, slope * (x - EXP_THRESHOLD + 1), torch.exp(x.clamp_max(EXP_THRESHOLD)))
 
 
@@ -138,6 +139,6 @@ def safe_log(ratio: Tensor) -> Tensor:
 
     The published code takes the plain logarithm, so boxes over e times their anchor never met their target.
     """
-    slope = torch.exp(ratio.new_tensor(EXP_THRESHOLD))
-    logarithm = torch.log(ratio.clamp(torch.finfo(ratio.dtype).tiny, float(slope)))
+    slope = math.exp(EXP_THRESHOLD)
+    logarithm = torch.log(ratio.clamp(torch.finfo(ratio.dtype).tiny, slope))
     return torch.where(ratio > slope, ratio / slope + EXP_THRESHOLD - 1, logarithm)

@@ -322,34 +322,39 @@ class SqueezeDet(Detector):
             raise ValueError(f"targets: expected {len(raw)}, one for each image, found {len(targets)}")
         height, width = raw.image_hw
         like = raw.deltas
-        cells = grid.grid_size(raw.image_hw)
-        anchors_cxcywh = grid.anchors_cxcywh(self.anchors, *cells, like.dtype, like.device)
+        cells, cpu = grid.grid_size(raw.image_hw), torch.device("cpu")
         anchors_xyxy = grid.anchors_xyxy(self.anchors, *cells, like.dtype, like.device)
+        anchors = [make(self.anchors, *cells, like.dtype, cpu) for make in (grid.anchors_cxcywh, grid.anchors_xyxy)]
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
         matched = torch.zeros_like(negative)
         image, anchor, true_boxes, labels, matches = [], [], [], [], []
         for b, target in enumerate(targets):
-            ignore = target.ignore.to(like.device)
+            # On the CPU, where an attack's targets are: what follows from them alone does not wait for a GPU.
+            ignore, target_xyxy = target.ignore.cpu(), target.boxes_xyxy.to(cpu, like.dtype)
             # Ignored regions are listed once per class.
-            ignored_xyxy = torch.unique(target.boxes_xyxy.to(like)[ignore], dim=0)
-            objects_xyxy = target.boxes_xyxy.to(like)[~ignore]
+            ignored_xyxy = torch.unique(target_xyxy[ignore], dim=0)
+            objects_xyxy = target_xyxy[~ignore]
+            anchor += grid.assign_anchors(objects_xyxy, *anchors)
+            counts = [len(objects_xyxy), len(ignored_xyxy)]
+            moved = torch.cat([objects_xyxy, ignored_xyxy]).to(like.device, non_blocking=True)
+            objects_xyxy, ignored_xyxy = moved.split(counts)
             if len(ignored_xyxy):
                 negative[b] = ~(
                     grid.covered_by_ignored(anchors_xyxy, ignored_xyxy)
                     | grid.covered_by_ignored(raw.boxes_xyxy[b], ignored_xyxy)
                 )
-            anchor += grid.assign_anchors(objects_xyxy, anchors_cxcywh, anchors_xyxy)
             image += [b] * len(objects_xyxy)
             true_boxes.append(objects_xyxy)
             meets = boxes.iou_matrix(objects_xyxy, raw.boxes_xyxy[b]) >= grid.MEETING_IOU
             matched[b] = meets.any(0)
             matches.append(raw.confidence_logits[b].expand_as(meets).masked_fill(~meets, -torch.inf).max(1))
-            labels.append(target.labels.to(like.device)[~ignore])
-        image = torch.tensor(image, dtype=torch.int64, device=like.device)
-        anchor = torch.tensor(anchor, dtype=torch.int64, device=like.device)
-        truth_xyxy, label = torch.cat(true_boxes), torch.cat(labels)
-        if bool(((label < 0) | (label >= len(self.classes))).any()):
-            raise ValueError(f"targets.labels: expected 0..{len(self.classes) - 1}, found {label.tolist()}")
+            labels += target.labels.cpu()[~ignore].tolist()
+        if not all(0 <= label < len(self.classes) for label in labels):
+            raise ValueError(f"targets.labels: expected 0..{len(self.classes) - 1}, found {labels}")
+        indices = torch.tensor([image, anchor, labels], dtype=torch.int64).to(like.device, non_blocking=True)
+        image, anchor, label = indices
+        truth_xyxy = torch.cat(true_boxes)
+        anchors_cxcywh = grid.anchors_cxcywh(self.anchors, *cells, like.dtype, like.device)
         negative[image, anchor] = False
         return AnchorAssignment(
             image=image,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -55,8 +56,13 @@ def symmetrise(offsets: Tensor) -> Tensor:
 def from_symmetric(code: Tensor) -> Tensor:
     """Symmetric offsets (..., 64, 3) from the 96 independent numbers (..., 96) of the half with z < 0."""
     half = code.reshape(*code.shape[:-1], LATTICE[0], LATTICE[1], LATTICE[2] // 2, 3)
-    mirror = half.flip(-2) * half.new_tensor([1.0, 1.0, -1.0])
+    mirror = half.flip(-2) * _mirror_signs(code.dtype, code.device)
     return torch.cat([half, mirror], dim=-2).reshape(*code.shape[:-1], LATTICE_POINTS, 3)
+
+
+@cache
+def _mirror_signs(dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor([1.0, 1.0, -1.0], dtype=dtype, device=device)
 
 
 def to_symmetric(offsets: Tensor) -> Tensor:

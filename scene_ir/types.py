@@ -561,6 +561,25 @@ class Render:
     or foliage may change every pixel."""
 
 
+def replace_unchecked(value: T, **changes: Any) -> T:
+    """`dataclasses.replace` without the checks of `__post_init__`, for changes that are valid by construction."""
+    changed = object.__new__(type(value))
+    for entry in fields(value):  # pyright: ignore[reportArgumentType]
+        content = changes[entry.name] if entry.name in changes else getattr(value, entry.name)
+        object.__setattr__(changed, entry.name, content)
+    return changed
+
+
+def to_host(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """Tensors of one device as float64 on the CPU, without gradients; from a GPU in one transfer."""
+    tensors = tuple(tensor.detach() for tensor in tensors)
+    if not any(tensor.is_cuda for tensor in tensors):
+        return tuple(tensor.double() for tensor in tensors)
+    values = torch.cat([tensor.double().flatten() for tensor in tensors]).cpu()
+    parts = values.split([tensor.numel() for tensor in tensors])
+    return tuple(part.view(tensor.shape) for part, tensor in zip(parts, tensors, strict=True))
+
+
 def convert_scene(value: T, dtype: torch.dtype | None, device: torch.device | str | None = None) -> T:
     """Convert a scene, or any part of it, to another dtype or device. Unchanged tensors are not copied.
 

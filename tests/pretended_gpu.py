@@ -112,21 +112,21 @@ def _storage(tensor: Tensor) -> Any:
 
 class _Move(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, tensor: Tensor, where: torch.device) -> Tensor:
+    def forward(ctx: Any, tensor: Tensor, where: torch.device, waits: bool = True) -> Tensor:
         ctx.back = place(tensor)
         with torch.utils._python_dispatch._disable_current_modes():
             moved = tensor.clone()
-        _count_copy()
+        _count_copy(waits)
         _put(moved, where)
         return moved
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        return _moved(grads[0], ctx.back), None
+        return _moved(grads[0], ctx.back), None, None
 
 
-def _moved(tensor: Tensor, where: torch.device) -> Tensor:
-    return tensor if place(tensor) == where else _Move.apply(tensor, where)  # pyright: ignore
+def _moved(tensor: Tensor, where: torch.device, waits: bool = True) -> Tensor:
+    return tensor if place(tensor) == where else _Move.apply(tensor, where, waits)  # pyright: ignore
 
 
 class _Operations(TorchDispatchMode):
@@ -148,16 +148,17 @@ class _Operations(TorchDispatchMode):
                 _put(leaf, where)
                 computes = True
         if there:
-            self._count(name, given, computes)
+            self._count(name, args, given, computes)
         return outcome
 
-    def _count(self, name: str, given: list[Tensor], computes: bool) -> None:
+    def _count(self, name: str, args: Any, given: list[Tensor], computes: bool) -> None:
+        indices = tree_leaves(args[1]) if name in _ANY_INDEX else []
         if name == "aten::_local_scalar_dense":
             _count_copy()
-        elif name in _WAITS or (name in _ANY_INDEX and any(t.dtype == torch.bool for t in given[1:])):
+        elif name in _WAITS or any(isinstance(i, Tensor) and i.dtype == torch.bool for i in indices):
             _traffic.waits[_line()] += 1
         if name in _COPIES and len({place(t) for t in given}) > 1:
-            _count_copy()
+            _count_copy(waits=args[2:] != (True,))
         elif computes and name not in _NO_KERNEL:
             _traffic.operations[_line()] += 1
 
@@ -209,6 +210,7 @@ class _Calls(TorchFunctionMode):
         tensor, where, rest = args[0], place(args[0]), []
         requested = kwargs.pop("device", None)
         other = kwargs.pop("other", None)
+        waits = not kwargs.pop("non_blocking", False)
         for value in args[1:]:
             if isinstance(value, Tensor):
                 other = value
@@ -222,7 +224,7 @@ class _Calls(TorchFunctionMode):
             where = _device(requested)
         rest = [value for value in rest if value is not None]
         changed = func(tensor, *rest, **kwargs) if rest or kwargs else tensor
-        return _moved(changed, where)
+        return _moved(changed, where, waits)
 
 
 def _device(requested: Any) -> torch.device:

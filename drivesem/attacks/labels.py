@@ -20,8 +20,8 @@ from detectors.types import CLASSES, Targets
 from drivesem.attacks.visibility import MIN_CONTRAST, compute_contrasts
 from scene_ir import ffd
 from scene_ir.errors import RangeError, ShapeError
-from scene_ir.geometry import place_vertices, to_clip, yaw_matrix
-from scene_ir.types import LATTICE, Category, Labels, Mesh, Render, SceneIR
+from scene_ir.geometry import yaw_matrix
+from scene_ir.types import LATTICE, Category, Labels, Mesh, Render, SceneIR, to_host
 
 Array = NDArray[np.float64]
 Levels = NDArray[np.int64]
@@ -110,6 +110,7 @@ class Labeller:
         self.difficulty = difficulty or Difficulty()
         self._projected_meshes: dict[int, tuple[Mesh, _ProjectedMesh]] = {}
         objects, camera = base.objects, base.camera
+        self._matrix, self._mesh_index = camera.matrix.cpu().double().numpy(), objects.mesh_index.tolist()
         self._limit = np.array([camera.width - 1.0, camera.height - 1.0] * 2)
         self._boxes = self._project(base)
         self._absent = ~_any_area(self._boxes)
@@ -124,19 +125,19 @@ class Labeller:
         # Moved boxes stay in the image, or where the benign box lies if that is outside of it.
         self._lowest = np.minimum(self._box2d, 0)
         self._highest = np.maximum(self._limit.astype(self._box2d.dtype), self._box2d)
-        ignore = torch.from_numpy(self._ignore).to(objects.translation.device)
+        ignore = torch.from_numpy(self._ignore)
         self._paper = SceneLabels(
             mode="paper",
-            boxes_xyxy=objects.box2d.detach(),
-            category=objects.category,
-            truncation=objects.truncation.detach(),
-            occlusion=objects.occlusion,
+            boxes_xyxy=torch.from_numpy(self._box2d),
+            category=objects.category.cpu(),
+            truncation=torch.from_numpy(self._truncation),
+            occlusion=torch.from_numpy(self._occlusion),
             ignore=ignore,
             became_ignored=torch.zeros_like(ignore),
             became_counted=torch.zeros_like(ignore),
             out_of_sight=torch.zeros_like(ignore),
-            regions_xyxy=base.ignore.detach(),
-            in_view=torch.from_numpy(_any_area(self._boxes)).to(objects.translation.device),
+            regions_xyxy=base.ignore.detach().cpu(),
+            in_view=torch.from_numpy(_any_area(self._boxes)),
         )
 
     def paper(self) -> SceneLabels:
@@ -147,6 +148,7 @@ class Labeller:
         """Labels that follow the objects. Raises ShapeError where `perturbed` has other objects."""
         if len(perturbed.objects) != len(self.base.objects):
             raise ShapeError("perturbed.objects", f"{len(self.base.objects)} objects", len(perturbed.objects))
+        render = None if render is None else _render_on_host(render)
         whole = self._project(perturbed)
         in_view = _any_area(whole)
         inside = self._clipped(whole)
@@ -165,19 +167,18 @@ class Labeller:
             gone = (hidden >= 1) & (self._hidden < 1)
             out_of_sight = (self._hidden <= 1 - _VISIBLE_BEFORE) & (hidden > 1 - _VISIBLE_NOW) & in_view
         hard = self._too_hard(boxes, truncation, occlusion) | gone | self._faint(render) | ~in_view
-        device = self._paper.boxes_xyxy.device
         return SceneLabels(
             mode="moved",
-            boxes_xyxy=torch.from_numpy(boxes).to(device),
-            category=perturbed.objects.category,
-            truncation=torch.from_numpy(truncation).to(device),
-            occlusion=torch.from_numpy(occlusion).to(device),
-            ignore=torch.from_numpy(self._ignore | hard).to(device),
-            became_ignored=torch.from_numpy(hard & ~self._ignore).to(device),
-            became_counted=torch.from_numpy(self._ignore & ~hard).to(device),
-            out_of_sight=torch.from_numpy(out_of_sight).to(device),
+            boxes_xyxy=torch.from_numpy(boxes),
+            category=self._paper.category,
+            truncation=torch.from_numpy(truncation),
+            occlusion=torch.from_numpy(occlusion),
+            ignore=torch.from_numpy(self._ignore | hard),
+            became_ignored=torch.from_numpy(hard & ~self._ignore),
+            became_counted=torch.from_numpy(self._ignore & ~hard),
+            out_of_sight=torch.from_numpy(out_of_sight),
             regions_xyxy=self._paper.regions_xyxy,
-            in_view=torch.from_numpy(in_view).to(device),
+            in_view=torch.from_numpy(in_view),
         )
 
     def labels(self, mode: LabelMode, perturbed: SceneIR, render: Render | None = None) -> SceneLabels:
@@ -224,12 +225,14 @@ class Labeller:
     def _project(self, scene: SceneIR) -> Array:
         """Tight boxes (N, 4) px of the deformed meshes, cut at the near plane, not at the image border."""
         objects = scene.objects
-        parts = (objects.ffd, objects.size_lhw, objects.yaw, objects.translation, scene.camera.matrix)
-        offsets, size, yaw, translation, matrix = (t.detach().cpu().double() for t in parts)
+        poses = to_host(objects.ffd, objects.size_lhw, objects.yaw, objects.translation)
+        offsets, size, yaw, translation = (values.numpy() for values in poses)
         # Placing and projecting are affine, so they are applied to the lattice instead of each vertex.
-        control = to_clip(place_vertices(_LATTICE_AT_REST + offsets, size, yaw, translation), matrix)
-        nets = control.transpose(1, 2).contiguous().numpy()
-        meshes = [scene.meshes[index] for index in objects.mesh_index.tolist()]
+        x, y, z = ((_LATTICE_AT_REST + offsets) * size[:, None]).transpose(2, 0, 1)
+        cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        placed = np.stack([cos * x + sin * z, y, cos * z - sin * x], axis=1) + translation[:, :, None]
+        nets = self._matrix[:, :3] @ placed + self._matrix[:, 3:]
+        meshes = [scene.meshes[index] for index in self._mesh_index]
         boxes = [self._projected_mesh(mesh).image_box(net) for mesh, net in zip(meshes, nets, strict=True)]
         return np.array(boxes, dtype=np.float64).reshape(-1, 4)
 
@@ -244,7 +247,23 @@ def visible_boxes(render: Render) -> Tensor:
         columns, rows = seen.any(axis=0).nonzero()[0], seen.any(axis=1).nonzero()[0]
         if len(rows):
             boxes[i] = (crop.x0 + columns[0], crop.y0 + rows[0], crop.x0 + columns[-1], crop.y0 + rows[-1])
-    return torch.from_numpy(boxes).to(render.object_id.device)
+    return torch.from_numpy(boxes)
+
+
+def _render_on_host(render: Render) -> Render:
+    """What labels need of a render, on the CPU: from a GPU in one transfer, as bytes."""
+    if not render.image.is_cuda:
+        return render
+    ids, levels = render.object_id.to(torch.int16), (render.image.detach().clamp(0, 1) * 255).round()
+    parts = [ids.view(torch.uint8), levels, *(crop.values >= _OPAQUE for crop in render.opacity)]
+    values = torch.cat([part.to(torch.uint8).flatten() for part in parts]).cpu()
+    numbers, picture, *opaque = values.split([part.numel() for part in parts])
+    opacity = tuple(
+        replace(crop, values=flags.view(crop.values.shape).float())
+        for crop, flags in zip(render.opacity, opaque, strict=True)
+    )
+    numbers = numbers.view(torch.int16).view(ids.shape).long()
+    return Render(picture.view(levels.shape).float() / 255, render.depth, numbers, opacity)
 
 
 def hidden_shares(render: Render) -> Array:
@@ -330,9 +349,9 @@ def _unit_extents(scene: SceneIR) -> tuple[Tensor, Tensor]:
 
 
 _SLICE = LATTICE[1] * LATTICE[2]
-_LATTICE_AT_REST = torch.cartesian_prod(
-    *(torch.linspace(0, 1, n, dtype=torch.float64) for n in LATTICE)
-) - torch.tensor([0.5, 1.0, 0.5], dtype=torch.float64)
+_LATTICE_AT_REST = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in LATTICE), indexing="ij"), axis=-1).reshape(
+    -1, 3
+) - np.array([0.5, 1.0, 0.5])
 """Lattice points (64, 3) in the unit box. Bernstein polynomials reproduce linear functions, so the weighted sum of
 these positions is the vertex itself."""
 

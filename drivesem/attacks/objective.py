@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -144,18 +145,18 @@ class Objective:
 
     def __call__(self, theta: Tensor) -> Tensor:
         """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
-        return _compute_losses([self], [theta])[0]
+        return _compute_losses([self], [theta])[0][0]
 
     def loss_and_grad(self, theta: Tensor, feasible: FeasibleSet | None = None) -> tuple[float, Tensor]:
         """Loss and its gradient (D,) at theta (D,), for the coordinates that `feasible` leaves free. Raises
         RangeError naming the coordinate where either is not finite.
         """
         leaf = theta.detach().clone().requires_grad_(True)
-        (loss,) = _compute_losses([self], [leaf])
+        ((loss, value),) = _compute_losses([self], [leaf])
         (gradient,) = torch.autograd.grad(loss, leaf)
         self.passes += GRADIENT_PASSES
         self.space.check_gradient(gradient)
-        return float(loss.detach()), gradient if feasible is None else feasible.project_gradient(theta, gradient)
+        return value, gradient if feasible is None else feasible.project_gradient(theta, gradient)
 
     @torch.no_grad()
     def evaluate(self, theta: Tensor) -> RenderEvaluation:
@@ -326,7 +327,7 @@ class Objective:
             render: its render.
         """
         labels = self.labeller.labels(self.label_mode, scene, render)
-        return self.compute_loss(self.differentiable, raw, labels.targets)
+        return self.compute_loss(self.differentiable, raw, labels.targets)[0]
 
     @torch.no_grad()
     def evaluate_render(self, scene: SceneIR, render: Render) -> RenderEvaluation:
@@ -337,14 +338,15 @@ class Objective:
         labels = (moved if self.label_mode == "moved" else paper).targets
         if isinstance(self.detector, Detector):
             raw = self.predict(render)
-            loss = float(self.compute_loss(self.detector, raw, labels))
-            detections = self.classes.map_detections(self.detector.decode(raw)[0])
+            _, loss = self.compute_loss(self.detector, raw, labels)
+            detections = self.classes.map_detections(_decode(self.detector, raw))
         else:
             detections = self.detect(render.image)
             loss = self._loss_without_gradient(detections, labels)
         return RenderEvaluation(scene, render, detections, paper, moved, loss)
 
-    def compute_loss(self, detector: Detector, raw: AnchorPredictions, labels: Targets) -> Tensor:
+    def compute_loss(self, detector: Detector, raw: AnchorPredictions, labels: Targets) -> tuple[Tensor, float]:
+        """The loss () of one image's predictions, and its value. Raises RangeError where it is not finite."""
         targets = self.classes.to_detector_targets(self.classes.map_targets(self.aim.targets(labels)))
         if callable(self.term):
             loss = self.term(detector.candidates(raw), targets, self.t_star)
@@ -359,9 +361,9 @@ class Objective:
             terms = detector.loss(raw, [targets])
             self._check_term((*terms, *losses.GOALS))
             loss = terms[self.term]
-        if not bool(torch.isfinite(loss)):
-            raise RangeError(f"objective: {self.term}", "a finite loss", float(loss.detach()))
-        return loss
+        if not math.isfinite(value := float(loss.detach())):
+            raise RangeError(f"objective: {self.term}", "a finite loss", value)
+        return loss, value
 
     def _loss_without_gradient(self, detections: Detections, labels: Targets) -> float:
         if callable(self.term):
@@ -405,7 +407,7 @@ def compute_gradients(objectives: Sequence[Objective], thetas: Sequence[Tensor])
 def _compute_batch(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tensor, Tensor]]:
     objectives, thetas = zip(*pairs, strict=True)
     leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
-    batch_losses = _compute_losses(objectives, leaves)
+    batch_losses = [loss for loss, _ in _compute_losses(objectives, leaves)]
     gradients = torch.autograd.grad(batch_losses, leaves)
     for objective, gradient in zip(objectives, gradients, strict=True):
         objective.passes += GRADIENT_PASSES
@@ -413,8 +415,8 @@ def _compute_batch(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tens
     return [(loss.detach(), gradient) for loss, gradient in zip(batch_losses, gradients, strict=True)]
 
 
-def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[Tensor]:
-    """The loss () of each objective at its theta (D,), differentiable; all share one detector. Scores seen on the
+def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[tuple[Tensor, float]]:
+    """The loss () of each objective at its theta (D,), differentiable, and its value; all share one detector. Scores seen on the
     way are cached for `Objective.preview`.
     """
     scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
@@ -437,12 +439,17 @@ def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -
         detector, raw = objective.differentiable, predictions[i]
         moved = objective.labeller.moved(scenes[i], renders[i])
         labels = moved if objective.label_mode == "moved" else objective.labeller.paper()
-        loss = objective.compute_loss(detector, raw, labels.targets)
+        loss, value = objective.compute_loss(detector, raw, labels.targets)
         with torch.no_grad():
-            detections = objective.classes.map_detections(detector.decode(raw)[0])
-        objective.previews[_key(theta)] = objective.score_image(float(loss.detach()), moved, detections)
-        batch_losses.append(loss)
+            detections = objective.classes.map_detections(_decode(detector, raw))
+        objective.previews[_key(theta)] = objective.score_image(value, moved, detections)
+        batch_losses.append((loss, value))
     return batch_losses
+
+
+def _decode(detector: Detector, raw: AnchorPredictions) -> Detections:
+    """The detections of one image; decoding takes many small steps, each of which would wait for a GPU."""
+    return detector.decode(raw.to_host() if type(raw) is AnchorPredictions else raw)[0]
 
 
 def _key(theta: Tensor) -> bytes:

@@ -29,6 +29,7 @@ from scene_ir.types import (
     WEATHER_DIM,
     SceneIR,
     Weather,
+    replace_unchecked,
 )
 
 ROI_DIM = 3
@@ -435,8 +436,10 @@ class ParameterSpace(ThetaSpace[Parameter]):
             changes["texture_code"] = _clamp_code(objects.texture_code, part.color, -budget.color, budget.color)
         if part.lamps is not None:
             changes["lamps"] = _clamp_code(objects.lamps, part.lamps[:, 0], -budget.lamps, budget.lamps)
-        if changes:
+        if part.size is not None:
             scene = scene.with_objects(**changes)
+        elif changes:  # of a valid scene by a finite theta
+            scene = replace_unchecked(scene, objects=replace_unchecked(scene.objects, **changes))
         codes: dict[str, Tensor] = {}
         if part.weather is not None:
             start = environment.weather

@@ -56,10 +56,12 @@ class EvaluatedClasses:
         return cls(tuple(name for name in CLASSES if name in own), own)
 
     def map_detections(self, detections: Detections) -> Detections:
-        """Detections of the evaluated classes; labels change from the detector's own classes to `names`."""
+        """Detections of the evaluated classes, on the CPU; labels change from the detector's own to `names`."""
+        if detections.scores.is_cuda:
+            detections = Detections(*(t.cpu() for t in (detections.boxes_xyxy, detections.labels, detections.scores)))
         if self.detector_classes == self.names:
             return detections
-        labels = _index_map(self.detector_classes, self.names).to(detections.labels.device)[detections.labels]
+        labels = _index_map(self.detector_classes, self.names)[detections.labels]
         rows = labels >= 0
         return Detections(detections.boxes_xyxy[rows], labels[rows], detections.scores[rows])
 

@@ -14,6 +14,7 @@ from enum import StrEnum
 from itertools import product
 from typing import Generic, TypeVar
 
+import numpy as np
 from torch import Tensor
 
 from scene_ir.errors import FormatError, RangeError, ShapeError
@@ -135,17 +136,17 @@ class ThetaSpace(ABC, Generic[P]):
         """Raise ShapeError for another shape than (D,), RangeError naming a coordinate that is not finite."""
         if tuple(theta.shape) != (self.dim,):
             raise ShapeError("theta", f"shape ({self.dim},)", tuple(theta.shape))
-        finite = theta.isfinite()
-        if not bool(finite.all()):
-            i = int((~finite).nonzero()[0])
-            raise RangeError(f"theta: {self.name(i)}", "a finite value", float(theta[i]))
+        values = theta.detach().cpu().numpy()
+        if not np.isfinite(values).all():
+            i = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise RangeError(f"theta: {self.name(i)}", "a finite value", float(values[i]))
 
     def check_gradient(self, gradient: Tensor) -> None:
         """Raise RangeError naming a coordinate of a gradient (D,) that is not finite."""
-        not_finite = (~gradient.isfinite()).nonzero()
-        if len(not_finite):
-            i = int(not_finite[0])
-            raise RangeError(f"gradient of {self.name(i)}", "a finite value", float(gradient[i]))
+        values = gradient.detach().cpu().numpy()
+        if not np.isfinite(values).all():
+            i = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise RangeError(f"gradient of {self.name(i)}", "a finite value", float(values[i]))
 
     @abstractmethod
     def physical(self, i: int, value: float) -> tuple[float, str] | None:

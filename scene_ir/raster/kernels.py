@@ -1194,9 +1194,7 @@ def rasterize(
     depth = torch.empty(size, dtype=torch.float32, device=clip.device)
     if size:
         order = _front_to_back_order(clip, faces, face_ranges, cull)
-        high, wide = (
-            (layout.rects[:, 2:] - layout.rects[:, :2]).amax(dim=0).flip(0).tolist() if len(order) else (0, 0)
-        )
+        wide, high = (max(r[k + 2] - r[k] for r in layout.host_rects) if len(order) else 0 for k in (0, 1))
         tiles = clip.new_empty(len(plan.parts), -(-high // TILE_PX), -(-wide // TILE_PX), dtype=torch.float32)
         inputs = [
             plan.lanes,
@@ -1386,7 +1384,8 @@ def _make_plan(
         parts, lanes = torch.tensor(rows, dtype=torch.int32).view(-1, 11), 1
         outlines = split_outlines(rows, len(cuts) - 1)
     else:
-        parts, lanes = gpu_parts(layout, face_ranges, cull), gpu_lanes(faces, layout.rects.shape[0])
+        parts = gpu_parts(layout, face_ranges, cull).to(clip.device, non_blocking=True)
+        lanes = gpu_lanes(faces, layout.rects.shape[0])
         cuts = outlines = [0, parts.shape[0] * lanes]
     boxes = torch.empty((clip.shape[0], 4), dtype=torch.int32, device=clip.device)
     inputs = [array(clip.contiguous(), wp.vec3f), near, array(boxes, wp.vec4i)]
@@ -1397,7 +1396,7 @@ def _make_plan(
 def _front_to_back_order(clip: Tensor, faces: Tensor, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
     """Faces (F,) int32 from nearest to farthest for a single CPU draw with visible back faces; else empty, (0,)."""
     if clip.device.type != "cpu" or len(face_ranges) != 1 or cull is not None or not len(faces):
-        return face_ranges.new_empty(0, dtype=torch.int32)
+        return torch.empty(0, dtype=torch.int32, device=clip.device)
     start, end = face_ranges[0].tolist()
     nearest = clip[:, 2][faces[start:end]].amin(dim=1)
     order = torch.arange(len(faces), dtype=torch.int32, device=clip.device)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,6 +22,8 @@ class PixelLayout:
     """(N, 4) int64 px, half-open (x0, y0, x1, y1); empty where x1 <= x0 or y1 <= y0."""
     offsets: Tensor
     """(N + 1,) int64, first packed pixel of each draw; row-major within a draw; the last is the pixel count T."""
+    _lists: list[list[Any]] = field(default_factory=list, init=False, compare=False, repr=False)
+    """Rects and offsets as lists, once needed."""
 
     def __post_init__(self) -> None:
         check_shape("layout.rects", self.rects, None, 4, floating=False)
@@ -33,13 +35,28 @@ class PixelLayout:
             raise RangeError("layout.offsets", "running pixel counts of layout.rects", self.offsets.tolist())
 
     @classmethod
-    def from_rects(cls, rects: Tensor) -> PixelLayout:
-        """The layout of rectangles (N, 4) px, half-open (x0, y0, x1, y1)."""
+    def _unchecked(cls, rects: Tensor, offsets: Tensor) -> PixelLayout:
+        layout = object.__new__(cls)
+        for name, value in (("rects", rects), ("offsets", offsets), ("_lists", [])):
+            object.__setattr__(layout, name, value)
+        return layout
+
+    @classmethod
+    def from_rects(cls, rects: Tensor, device: torch.device | None = None) -> PixelLayout:
+        """The layout of rectangles.
+
+        Args:
+            rects: (N, 4) px, half-open (x0, y0, x1, y1).
+            device: Device of the layout; by default that of `rects`. From the CPU, nothing waits for a GPU.
+        """
         check_shape("layout.rects", rects, None, 4, floating=False)
         rects = rects.to(torch.int64)
-        layout = object.__new__(cls)  # skips the check of its offsets
-        object.__setattr__(layout, "rects", rects)
-        object.__setattr__(layout, "offsets", _offsets(rects))
+        offsets = _offsets(rects)
+        if device is None or device == rects.device:
+            return cls._unchecked(rects, offsets)
+        both = torch.cat([rects.flatten(), offsets]).to(device, non_blocking=True)
+        layout = cls._unchecked(both[: rects.numel()].view(-1, 4), both[rects.numel() :])
+        layout._lists.extend([rects.tolist(), offsets.tolist()])
         return layout
 
     @classmethod
@@ -48,15 +65,27 @@ class PixelLayout:
         rects = torch.empty(len(pixels), 4, dtype=torch.int64, device=pixels.device)
         rects[:, :2] = pixels
         torch.add(rects[:, :2], 1, out=rects[:, 2:])
-        layout = object.__new__(cls)
-        object.__setattr__(layout, "rects", rects)
-        object.__setattr__(layout, "offsets", torch.arange(len(pixels) + 1, device=pixels.device))
-        return layout
+        return cls._unchecked(rects, torch.arange(len(pixels) + 1, device=pixels.device))
+
+    @property
+    def host_rects(self) -> list[list[int]]:
+        """`rects` as lists."""
+        return self._host()[0]
+
+    @property
+    def host_offsets(self) -> list[int]:
+        """`offsets` as a list."""
+        return self._host()[1]
+
+    def _host(self) -> list[list[Any]]:
+        if not self._lists:
+            self._lists.extend([self.rects.tolist(), self.offsets.tolist()])
+        return self._lists
 
     @property
     def size(self) -> int:
         """Number T of packed pixels."""
-        return int(self.offsets[-1])
+        return self.host_offsets[-1] if self._lists else int(self.offsets[-1])
 
     def draw_index(self) -> Tensor:
         """Draw (T,) int64 of each packed pixel."""
@@ -73,8 +102,8 @@ class PixelLayout:
 
     def spans(self) -> list[tuple[slice, tuple[int, int]]]:
         """Packed pixels of each draw as a slice, with the draw's (height, width) in px."""
-        edges = self.offsets.tolist()
-        shapes = [(max(y1 - y0, 0), max(x1 - x0, 0)) for x0, y0, x1, y1 in self.rects.tolist()]
+        edges = self.host_offsets
+        shapes = [(max(y1 - y0, 0), max(x1 - x0, 0)) for x0, y0, x1, y1 in self.host_rects]
         return [(slice(edges[i], edges[i + 1]), shape) for i, shape in enumerate(shapes)]
 
 
@@ -150,7 +179,7 @@ _GPU_LANES = 8192
 """Most GPU threads that share the triangles of a draw."""
 
 
-class _TensorCache(Generic[V]):
+class TensorCache(Generic[V]):
     """A function of a tensor, computed once while the tensor lives unchanged."""
 
     def __init__(self, compute: Callable[[Tensor], V]) -> None:
@@ -178,8 +207,8 @@ def _index_range(faces: Tensor) -> tuple[int, int]:
     return int(low), int(high)
 
 
-_index_ranges = _TensorCache(_index_range)
-_int32_copies = _TensorCache(lambda faces: faces.to(torch.int32).contiguous())
+_index_ranges = TensorCache(_index_range)
+_int32_copies = TensorCache(lambda faces: faces.to(torch.int32).contiguous())
 
 
 def index_range(faces: Tensor) -> tuple[int, int]:
@@ -212,7 +241,7 @@ def split_for_threads(
     draws = [
         (rect, offset, faces, flag)
         for rect, offset, faces, flag in zip(
-            layout.rects.tolist(), layout.offsets.tolist()[:-1], face_ranges.tolist(), culled, strict=True
+            layout.host_rects, layout.host_offsets[:-1], face_ranges.tolist(), culled, strict=True
         )
         if rect[2] > rect[0] and rect[3] > rect[1]
     ]
@@ -260,17 +289,17 @@ def _row_work(rect: Sequence[int], faces: Sequence[int], row: int) -> float:
 
 
 def gpu_parts(layout: PixelLayout, face_ranges: Tensor, cull: Tensor | None) -> Tensor:
-    """`RasterPlan.parts` with one part per draw, without waiting for the device.
+    """`RasterPlan.parts` (N, 11) on the CPU, with one part per draw.
 
     Args:
         layout: Pixels of the draws.
-        face_ranges: (N, 2) first face and end face of each draw.
-        cull: (N,) bool, or None.
+        face_ranges: (N, 2) first face and end face of each draw, on the CPU.
+        cull: (N,) bool, on the CPU, or None.
     """
-    flag = torch.zeros_like(face_ranges[:, :1]) if cull is None else cull.to(face_ranges)[:, None]
-    first = layout.offsets[:-1, None]
-    rows = layout.rects[:, [1, 3]]
-    return torch.cat([layout.rects, rows, first, face_ranges, flag, first], dim=1).to(torch.int32)
+    flags = [False] * len(face_ranges) if cull is None else cull.tolist()
+    draws = zip(layout.host_rects, layout.host_offsets[:-1], face_ranges.tolist(), flags, strict=True)
+    rows = [[*rect, rect[1], rect[3], first, *faces, flag, first] for rect, first, faces, flag in draws]
+    return torch.tensor(rows, dtype=torch.int32).view(-1, 11)
 
 
 def gpu_lanes(faces: Tensor, draws: int) -> int:

@@ -63,7 +63,8 @@ def rasterize(
     Args:
         clip: (V, 3) clip coordinates.
         faces: (F, 3) int; both windings are visible.
-        face_ranges: (N, 2) int; draw i covers faces [start, end) inside layout.rects[i]; ranges may overlap.
+        face_ranges: (N, 2) int; draw i covers faces [start, end) inside layout.rects[i]; ranges may overlap. On
+            the CPU, nothing waits for a GPU; likewise `cull`.
         layout: Pixels of the draws.
         backend: Implementation.
         near: Near plane, m.
@@ -71,19 +72,22 @@ def rasterize(
 
     Raises:
         ShapeError: On wrong shapes or dtypes.
-        RangeError: On values that are not finite, or indices out of range.
+        RangeError: On values that are not finite (not checked on a GPU), or indices out of range.
     """
     _check_mesh(clip, faces, backend)
-    _check_finite("raster.clip", clip)
+    if not clip.is_cuda:  # it would wait
+        _check_finite("raster.clip", clip)
     count = layout.rects.shape[0]
     check_shape("raster.face_ranges", face_ranges, count, 2, floating=False)
     if near <= 0:
         raise RangeError("raster.near", "a positive distance", near)
     ranges = face_ranges.tolist()
+    face_ranges = torch.tensor(ranges, dtype=torch.int64).view(-1, 2)
     if not all(0 <= end <= faces.shape[0] for pair in ranges for end in pair):
         raise RangeError("raster.face_ranges", f"indices in [0, {faces.shape[0]}]", ranges)
-    face_ranges = face_ranges.to(torch.int64)
     culled = _cull_flags(cull, face_ranges)
+    if backend == "reference":
+        face_ranges, culled = face_ranges.to(clip.device), None if culled is None else culled.to(clip.device)
     face, depth, plan = _backend_module(backend).rasterize(clip.detach(), faces, face_ranges, layout, near, culled)
     return Fragments(layout, face, depth, face_ranges, near, culled, plan)
 

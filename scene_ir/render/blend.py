@@ -14,7 +14,7 @@ from scene_ir.geometry import ground_footprint
 from scene_ir.raster.layout import PixelLayout
 from scene_ir.raster.verbs import Backend
 from scene_ir.render.model import SATURATED
-from scene_ir.types import Occluder
+from scene_ir.types import Occluder, to_host
 
 _OCCLUDER_WIDTH_M = 0.4
 """Width on the ground of what stands in front of vehicles: about a person's."""
@@ -63,7 +63,7 @@ class BlendPlan:
 def _spans(layout: PixelLayout) -> tuple[LayerSpan, ...]:
     """Positions of the packed pixels of each draw."""
     out: list[LayerSpan] = []
-    for (packed, size), (x0, y0, _, _) in zip(layout.spans(), layout.rects.tolist(), strict=True):
+    for (packed, size), (x0, y0, _, _) in zip(layout.spans(), layout.host_rects, strict=True):
         out.append((packed, (slice(y0, y0 + size[0]), slice(x0, x0 + size[1])), size))
     return tuple(out)
 
@@ -135,9 +135,13 @@ def composite(
     if backend == "warp":
         from scene_ir.render.kernels import blending
 
-        rects = [(plan.layout, plan.order), (plan.shadow_layout, plan.shadows)]
-        layers, shadows = (_stack_inputs(layout, order) for layout, order in rects)
-        edges = blending.row_edges(canvas.shape[1], torch.cat([layers[1], shadows[1]]).cpu().numpy())
+        numbers = torch.tensor([*plan.order, *plan.shadows], dtype=torch.int32)
+        numbers = numbers.to(canvas.device, non_blocking=True)
+        order, own = numbers.split([len(plan.order), len(plan.shadows)])
+        layers = order, plan.layout.rects, plan.layout.offsets
+        shadows = own, plan.shadow_layout.rects, plan.shadow_layout.offsets
+        rects = np.array(plan.layout.host_rects + plan.shadow_layout.host_rects, dtype=np.int64).reshape(-1, 4)
+        edges = blending.row_edges(canvas.shape[1], rects)
         return blending.BlendLayers.apply(
             canvas, factor, colour, opacity, z, depth, (shadows, layers, edges), clamped
         )
@@ -161,7 +165,7 @@ def visible_rects(layout: PixelLayout, visible: Tensor) -> Tensor:
     """
     rects: list[list[int]] = []
     packed, channels = visible.cpu().numpy(), visible.shape[1]
-    for (part, size), whole in zip(layout.spans(), layout.rects.tolist(), strict=True):
+    for (part, size), whole in zip(layout.spans(), layout.host_rects, strict=True):
         pixels = packed[part].reshape(size[0], size[1] * channels)
         columns, rows = np.flatnonzero(pixels.any(0)) // channels, np.flatnonzero(pixels.any(1))
         if not len(columns):
@@ -171,10 +175,6 @@ def visible_rects(layout: PixelLayout, visible: Tensor) -> Tensor:
         x1, y1 = whole[0] + int(columns[-1]) + 2, whole[1] + int(rows[-1]) + 2
         rects.append([max(x0, whole[0]), max(y0, whole[1]), min(x1, whole[2]), min(y1, whole[3])])
     return torch.tensor(rects, dtype=torch.int64).reshape(-1, 4)
-
-
-def _stack_inputs(layout: PixelLayout, order: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.tensor(order, dtype=torch.int32, device=layout.rects.device), layout.rects, layout.offsets
 
 
 class _ReferenceBlend(torch.autograd.Function):
@@ -240,8 +240,9 @@ def paint_order(
         standing: (K, 4, 2) m, footprints of occluders, see `occluder_footprints`.
     """
     count = int(translation.shape[0])
-    corners = ground_footprint(size_lhw.detach(), yaw.detach(), translation.detach()).cpu().double().numpy()
-    eye = centre.detach().cpu().double().numpy()[[0, 2]]
+    size, turn, place, camera = to_host(size_lhw, yaw, translation, centre)
+    dtype, eye = yaw.dtype, camera.numpy()[[0, 2]]
+    corners = ground_footprint(size.to(dtype), turn.to(dtype), place.to(dtype)).double().numpy()
     nearest = _nearest_distance(corners, eye)
     first, second = np.triu_indices(count, 1)
     side = _in_front(corners[first], corners[second], eye, nearest[second] - nearest[first])

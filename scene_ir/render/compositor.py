@@ -32,7 +32,7 @@ from scene_ir.render.reflections import by_row, mirror_in_ground
 from scene_ir.render.spray import draw_spray
 from scene_ir.render.texture import PaintRegions
 from scene_ir.render.windscreen import add_drops
-from scene_ir.types import Crop, Objects, Render, SceneIR, Weather
+from scene_ir.types import Crop, Objects, Render, SceneIR, Weather, replace_unchecked
 
 
 def render(scenes: Sequence[SceneIR], settings: RenderSettings | None = None) -> list[Render]:
@@ -81,7 +81,8 @@ class Compositor(PreparedScene):
         if len(objects) != len(self.scene.objects):
             raise ShapeError("objects", f"the {len(self.scene.objects)} of the base scene", len(objects))
         names = ("translation", "yaw", "size_lhw", "ffd", "texture_code", "lamps")
-        return replace(self.scene.objects, **{name: getattr(objects, name).to(self.like) for name in names})
+        changes = {name: getattr(objects, name).to(self.like) for name in names}
+        return replace_unchecked(self.scene.objects, **changes)
 
     def compose(self, perturbed: SceneIR, objects: Objects, layers: ObjectLayers | None) -> Render:
         """Blend drawn objects into the picture.
@@ -105,7 +106,9 @@ class Compositor(PreparedScene):
         if self.occluders is not None:
             changed = foliage or closed_sky is not None
             layers = self.occluders.append_to(layers, canvas[:3] - self.canvas[:3] if changed else None)
-        drawn = None if weather or foliage or drops else torch.zeros(0, 4, dtype=torch.int64)
+        # On a GPU pictures are evaluated whole, and finding the regions would wait for it.
+        unknown = weather or foliage or drops or self.like.is_cuda
+        drawn = None if unknown else torch.zeros(0, 4, dtype=torch.int64)
         behind = self.scene.environment
         shows: Tensor | None = None
         if layers is None:

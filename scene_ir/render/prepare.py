@@ -21,7 +21,9 @@ import torch
 from torch import Tensor
 
 from scene_ir.meshes.lod import level_of_detail
+from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
+from scene_ir.raster.layout import TensorCache
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
 from scene_ir.render.environment import (
     PerturbedSun,
@@ -33,7 +35,7 @@ from scene_ir.render.lamps import VehicleLamps, find_lamps
 from scene_ir.render.night import NightMaps, compute_night_maps
 from scene_ir.render.surfaces import ObjectSurfaces, TemplateSurface, VertexPlacement
 from scene_ir.render.texture import PaintRegions, PhotographTexels, smoothstep
-from scene_ir.types import Crop, Environment, Objects, SceneIR, convert_scene
+from scene_ir.types import Crop, Environment, Objects, SceneIR, convert_scene, to_host
 
 MAX_HALO_PX = 64.0
 """Largest reach of a halo: of a car that fills the picture's height, a sixth."""
@@ -553,9 +555,10 @@ class PreparedScene:
         """Reach of each object's halo beyond its mesh, px."""
         if not objects.source:
             return [0.0] * len(objects)
-        distance = surfaces.project_vertices(objects.translation.detach(), self.scene.camera)[:, 2].clamp(min=1.0)
-        halo = self.halo * (objects.size_lhw / self.base_size_lhw).detach().amax(dim=1)
-        return (halo / distance).clamp(max=MAX_HALO_PX).tolist()
+        parts = (objects.translation, objects.size_lhw, self.base_size_lhw, self.halo, self.scene.camera.matrix)
+        translation, size, base_size, halo, matrix = (values.to(self.like.dtype) for values in to_host(*parts))
+        distance = to_clip(translation, matrix)[:, 2].clamp(min=1.0)
+        return (halo * (size / base_size).amax(dim=1) / distance).clamp(max=MAX_HALO_PX).tolist()
 
     def template_attributes(self, normals: Tensor, depth: Tensor) -> Tensor:
         """(V, channels.PLAIN) appearance of the templates. normals (V, 3); depth (V,) m."""
@@ -689,11 +692,9 @@ class SceneBatch:
         self._faces, self._vertex_ranges, self._face_ranges = ObjectSurfaces.concat_faces(
             [m.surfaces for m in members]
         )
-        self._face_range_tensor = torch.tensor(
-            self._face_ranges, dtype=torch.int64, device=self._faces.device
-        ).reshape(-1, 2)
+        self._face_range_tensor = torch.tensor(self._face_ranges, dtype=torch.int64).reshape(-1, 2)
         closed = [s.closed for m in members for s in m.surfaces.templates]
-        self._cull = torch.tensor(closed, dtype=torch.bool, device=self._faces.device)
+        self._cull = torch.tensor(closed, dtype=torch.bool)
         self.counts = [len(m.scene.objects) for m in members]
         cameras = [m.scene.camera for m in members]
         self._frames_hw = [
@@ -774,21 +775,22 @@ class SceneBatch:
         """
         backend, reach = self._backend, self.reach_px(objects)
         geometry = self.place(objects, suns, with_ground)
+        clip, patch_clip = to_host(geometry.clip, geometry.patch_clip)
         rects = surfaces.crop_rects(
-            geometry.clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
+            clip, self._faces, self._vertex_ranges, self._face_ranges, self._frames_hw,
             [2.0 + r for r in reach],
         )  # fmt: skip
-        layout = verbs.PixelLayout.from_rects(rects)
+        layout = verbs.PixelLayout.from_rects(rects, geometry.clip.device)
         mesh = verbs.rasterize(
             geometry.clip, self._faces, self._face_range_tensor, layout, backend, cull=self._cull
         )
         coverage = verbs.antialias(mesh, geometry.clip, self._faces, backend=backend)
         faces, _, face_ranges = self._patches
         patch_rects = surfaces.crop_rects(
-            geometry.patch_clip, faces, self._patch_corners, self._patch_faces, self._frames_hw, [0.0] * len(reach)
+            patch_clip, faces, self._patch_corners, self._patch_faces, self._frames_hw, [0.0] * len(reach)
         )
         patch_rects[self._shadowless] = 0
-        ground_layout = verbs.PixelLayout.from_rects(patch_rects)
+        ground_layout = verbs.PixelLayout.from_rects(patch_rects, geometry.clip.device)
         ground = None
         if with_ground:
             ground = verbs.rasterize(geometry.patch_clip, faces, face_ranges, ground_layout, backend)
@@ -838,4 +840,7 @@ def patch_faces(count: int, device: torch.device) -> tuple[Tensor, Tensor, Tenso
 
 def is_active(code: Tensor) -> bool:
     """Whether a code must be applied: it is not 0, or needs a gradient."""
-    return code.requires_grad or bool((code.detach() != 0).any())
+    return code.requires_grad or _any_nonzero(code)
+
+
+_any_nonzero = TensorCache(lambda code: bool((code != 0).any()))

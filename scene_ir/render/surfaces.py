@@ -21,7 +21,7 @@ from scene_ir.ffd import lattice_weights
 from scene_ir.geometry import to_clip, vertex_normals
 from scene_ir.raster import verbs
 from scene_ir.render import model
-from scene_ir.types import Camera, Mesh, Objects, Part
+from scene_ir.types import Camera, Mesh, Objects, Part, check_finite
 
 CREASE_RAD = 0.7
 """Faces that meet at a larger angle keep a sharp edge in shading: 40 degrees, the usual choice of modelling tools.
@@ -371,7 +371,7 @@ class VertexPlacement:
 
         Rows x, y, z: a product with three rows is three times as fast as one with three columns.
         """
-        if torch.equal(ffd, self.base_ffd):
+        if not ffd.is_cuda and torch.equal(ffd, self.base_ffd):
             return self.base_bend
         linear = torch.nn.functional.linear
         parts = [linear(own.T.contiguous(), weights) for own, weights in zip(ffd, self.weights, strict=True)]
@@ -627,30 +627,29 @@ def crop_rects(
     plane. Empty for a draw behind the camera or outside its image.
 
     Args:
-        clip: (V, 3).
+        clip: (V, 3), on the CPU.
         faces: (F, 3).
         vertex_ranges, face_ranges: [start, end) of each draw; vertex ranges are consecutive.
         frames_hw: Image size of each draw, px.
         margins_px: Margin of each draw.
     """
+    check_finite("raster.clip", clip)
     rects = np.zeros((len(vertex_ranges), 4), dtype=np.int64)
     filled = [i for i, (start, end) in enumerate(vertex_ranges) if end > start]
     if filled:
-        points = clip.detach().cpu().numpy().astype(np.float64)
+        points = clip.double().numpy()
         starts = np.array([vertex_ranges[i][0] for i in filled])
         nearest = np.minimum.reduceat(points[:, 2], starts)
         px = points[:, :2] / np.maximum(points[:, 2:], verbs.NEAR_M)
-        bounds = np.concatenate([np.minimum.reduceat(px, starts), np.maximum.reduceat(px, starts)], axis=1)
-        for row, i in enumerate(filled):
-            box = bounds[row] if nearest[row] >= verbs.NEAR_M else _clipped_bounds(points, faces, face_ranges[i])
-            if box is None:
-                continue
-            limit = np.array(frames_hw[i][::-1], dtype=np.float64)
-            low = np.clip(np.ceil(box[:2] - margins_px[i]), 0.0, limit)
-            high = np.clip(np.floor(box[2:] + margins_px[i]) + 1.0, 0.0, limit)
-            if (high > low).all():
-                rects[i] = np.concatenate([low, high])
-    return torch.from_numpy(rects).to(clip.device)
+        first, last = np.minimum.reduceat(px, starts), np.maximum.reduceat(px, starts)
+        for row in np.flatnonzero(nearest < verbs.NEAR_M):
+            box = _clipped_bounds(points, faces, face_ranges[filled[row]])
+            first[row], last[row] = (np.inf, -np.inf) if box is None else (box[:2], box[2:])
+        margin, limit = np.array(margins_px)[filled, None], np.array(frames_hw, dtype=np.float64)[filled, ::-1]
+        low = np.minimum(np.maximum(np.ceil(first - margin), 0.0), limit)
+        high = np.minimum(np.maximum(np.floor(last + margin) + 1.0, 0.0), limit)
+        rects[filled] = np.concatenate([low, high], axis=1) * (high > low).all(axis=1, keepdims=True)
+    return torch.from_numpy(rects)
 
 
 def _clipped_bounds(points: np.ndarray, faces: Tensor, face_range: Sequence[int]) -> np.ndarray | None:
@@ -678,17 +677,17 @@ def nearest_hits(
         fragments: Visible faces.
         reach_px: Reach of each draw.
         draws: Draws to process; all by default.
-        out: (T,) to write the draws' part into.
+        out: (T,) to write the draws' part into; on a GPU the whole.
     """
-    layout = fragments.layout
-    nearest = torch.empty_like(fragments.face, dtype=torch.int64) if out is None else out
-    spans, rects = layout.offsets.tolist(), layout.rects.tolist()
+    layout, face = fragments.layout, fragments.face.cpu()
+    nearest = torch.empty_like(face, dtype=torch.int64) if out is None or out.is_cuda else out
+    spans, rects = layout.host_offsets, layout.host_rects
     for i in draws if draws is not None else range(len(rects)):
         start, end = spans[i], spans[i + 1]
         if end == start:
             continue
         x0, y0, x1, y1 = rects[i]
-        missed = (fragments.face[start:end].cpu().numpy() < 0).reshape(y1 - y0, x1 - x0)
+        missed = (face[start:end].numpy() < 0).reshape(y1 - y0, x1 - x0)
         if missed.all():
             nearest[start:end] = -1
             continue
@@ -696,7 +695,9 @@ def nearest_hits(
         index += start
         index[distance > reach_px[i]] = -1
         nearest[start:end].copy_(torch.from_numpy(index.reshape(-1)))
-    return nearest
+    if out is not None:
+        return nearest if out is nearest else out.copy_(nearest, non_blocking=True)
+    return nearest.to(fragments.face.device, non_blocking=True)
 
 
 def nearest_true_pixel(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -59,13 +59,20 @@ class _ObjectRanges:
     """Objects [start, end) as ranges of packed pixels, which one thread draws from the first stage to the last."""
 
     def __init__(self, s: ShadingInputs) -> None:
-        self.pixels = s.visible.mesh.layout.offsets.tolist()
-        self.ground = s.visible.patch_layout.offsets.tolist()
+        self.pixels = s.visible.mesh.layout.host_offsets
+        self.ground = s.visible.patch_layout.host_offsets
         count = len(self.pixels) - 1
         work = (2 * np.diff(self.pixels) + np.diff(self.ground)).tolist()
         # A GPU and a painter process all objects at once.
         whole = s.fixed.faces.device.type != "cpu" or s.painter is not None
         self.edges = [0, count] if whole else split_by_work(list(range(count + 1)), work)
+
+
+def _nonzero(values: Tensor) -> Tensor:
+    """Indices of values (K,) other than 0; on a GPU followed by -1 up to (K,): nothing waits for their number."""
+    if not values.is_cuda:
+        return values.nonzero()[:, 0]
+    return torch.nonzero_static(values, size=len(values))[:, 0]
 
 
 @dataclass(slots=True)
@@ -149,11 +156,11 @@ class PhotographedPixels(torch.autograd.Function):
             surfaces.nearest_hits(visible.mesh, visible.reach_px, range(start, end), nearest)
             launch(shading.lookup_kernel, [first, last], [pixels, vertices, lookups], device)
             # Partly covered pixels: of what is hit, at least half is covered.
-            partial[start] = rim = coverage[first:last].frac().nonzero()[:, 0].add_(first)
+            partial[start] = rim = _nonzero(coverage[first:last].frac()).add_(first)
             launch(shading.save_kernel, [0, rim.shape[0]], [array(rim), lookups], device)
             launch(shading.extend_kernel, [0, rim.shape[0]], [array(rim), pixels, lookups], device)
             launch(shading.shade_kernel, [first, last], [pixels, photograph, lookups, final, layers], device)
-            unseen_pixels[start] = need = unseen[first:last].nonzero()[:, 0] + first
+            unseen_pixels[start] = need = _nonzero(unseen[first:last]).add_(first)
             if need.numel():
                 inputs = [array(need), pixels, vertices, photograph, lookups, final, layers]
                 launch(shading.complete_kernel, [0, need.shape[0]], inputs, device)

@@ -443,6 +443,8 @@ def save_kernel(start: int, partial: Longs, lookups: Lookups):
         start, partial, lookups: See the module.
     """
     i = wp.int32(partial[start + wp.tid()])
+    if i < 0:
+        return
     lookups.found[i] = lookups.lookup[i]
 
 
@@ -454,6 +456,8 @@ def extend_kernel(start: int, partial: Longs, pixels: PackedPixels, lookups: Loo
         start, partial, pixels, lookups: See the module.
     """
     i = wp.int32(partial[start + wp.tid()])
+    if i < 0:
+        return
     f = _outline_blend(pixels, i)
     mean = (
         _saved_lookup(pixels, lookups, f.pixel[0]) * f.weight[0]
@@ -474,6 +478,8 @@ def move_gradients_kernel(start: int, partial: Longs, grads: PixelGradients):
         start, partial, grads: See the module.
     """
     i = wp.int32(partial[start + wp.tid()])
+    if i < 0:
+        return
     grads.moved_lookup[i] = grads.lookup[i]
     grads.lookup[i] = lookup_t()
 
@@ -502,6 +508,8 @@ def extend_backward_kernel(
         start, partial, pixels, lookups, grads: See the module.
     """
     i = wp.int32(partial[start + wp.tid()])
+    if i < 0:
+        return
     f = _outline_blend(pixels, i)
     g = grads.moved_lookup[i]
     rest = 1.0 - f.own
@@ -1242,6 +1250,8 @@ def complete_kernel(
         start, need, pixels, vertices, photograph, lookups, final, layers: See the module.
     """
     i = wp.int32(need[start + wp.tid()])
+    if i < 0:
+        return
     at = pixels.table[i]
     o = at[0]
     v = _blended_attributes(pixels, vertices, i)
@@ -1275,6 +1285,8 @@ def complete_backward_kernel(
         start, need, pixels, vertices, photograph, lookups, final, to_layers, grads: See the module.
     """
     i = wp.int32(need[start + wp.tid()])
+    if i < 0:
+        return
     at = pixels.table[i]
     o = at[0]
     v = _blended_attributes(pixels, vertices, i)
