@@ -148,6 +148,7 @@ class Labeller:
         """Labels that follow the objects. Raises ShapeError where `perturbed` has other objects."""
         if len(perturbed.objects) != len(self.base.objects):
             raise ShapeError("perturbed.objects", f"{len(self.base.objects)} objects", len(perturbed.objects))
+        category = perturbed.objects.category
         render = None if render is None else _render_on_host(render)
         whole = self._project(perturbed)
         in_view = _any_area(whole)
@@ -170,7 +171,7 @@ class Labeller:
         return SceneLabels(
             mode="moved",
             boxes_xyxy=torch.from_numpy(boxes),
-            category=self._paper.category,
+            category=self._paper.category if category is self.base.objects.category else category.cpu(),
             truncation=torch.from_numpy(truncation),
             occlusion=torch.from_numpy(occlusion),
             ignore=torch.from_numpy(self._ignore | hard),
@@ -232,7 +233,8 @@ class Labeller:
         cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         placed = np.stack([cos * x + sin * z, y, cos * z - sin * x], axis=1) + translation[:, :, None]
         nets = self._matrix[:, :3] @ placed + self._matrix[:, 3:]
-        meshes = [scene.meshes[index] for index in self._mesh_index]
+        same = objects.mesh_index is self.base.objects.mesh_index
+        meshes = [scene.meshes[index] for index in (self._mesh_index if same else objects.mesh_index.tolist())]
         boxes = [self._projected_mesh(mesh).image_box(net) for mesh, net in zip(meshes, nets, strict=True)]
         return np.array(boxes, dtype=np.float64).reshape(-1, 4)
 
