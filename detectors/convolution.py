@@ -7,6 +7,7 @@ are fused into the convolution (`OneDnnWeights`). Images and all other weights a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +18,8 @@ _RELU_BACKWARD = torch.ops.aten.threshold_backward.grad_input
 _LEAKY_RELU_BACKWARD = torch.ops.aten.leaky_relu_backward.grad_input
 _MAX_SIZES = 1024
 """Input sizes remembered per layer, as many as oneDNN does."""
+_MAX_LAYOUTS = 1 << 14
+"""Layouts remembered in all: some 200 bytes each."""
 _UNSET = slice(108, 112)
 """Bytes between dtype and padded sides in oneDNN's dnnl_memory_desc (64 bit)."""
 
@@ -28,6 +31,9 @@ class OneDnnWeights:
     weights in each call, which from one of its own layouts takes as long as the convolution itself. So each input
     size is queried once. A layer has two or three distinct layouts; each is stored once.
     """
+
+    _layouts: ClassVar[dict[tuple[object, ...], bytes]] = {}
+    """Layouts of all layers, by the shape of the weights and the input size."""
 
     def __init__(self, weight: Tensor) -> None:
         self.plain = to_channels_last(weight)
@@ -53,13 +59,25 @@ class OneDnnWeights:
         key = x.shape, stride, padding, torch.get_num_threads()
         weight = self._by_size.get(key)
         if weight is None:
-            reordered = _ONEDNN._reorder_convolution_weight(
-                self.plain, [padding] * 2, [stride] * 2, [1, 1], 1, list(x.shape)
-            )
+            known = self._layouts.get((self.plain.shape, *key))  # of another layer of this shape
+            weight = None if known is None else self._by_layout.get(known)
+            if weight is None:
+                weight = self._reorder(key)
             if len(self._by_size) >= _MAX_SIZES:
                 self._by_size.clear()
-            weight = self._by_size[key] = self._by_layout.setdefault(_layout_key(reordered), reordered)
+            self._by_size[key] = weight
         return weight
+
+    def _reorder(self, key: tuple[torch.Size, int, int, int]) -> Tensor:
+        shape, stride, padding, _ = key
+        reordered = _ONEDNN._reorder_convolution_weight(
+            self.plain, [padding] * 2, [stride] * 2, [1, 1], 1, list(shape)
+        )
+        layout = _layout_key(reordered)
+        if len(self._layouts) >= _MAX_LAYOUTS:
+            self._layouts.clear()
+        self._layouts[(self.plain.shape, *key)] = layout
+        return self._by_layout.setdefault(layout, reordered)
 
 
 def _layout_key(weight: Tensor) -> bytes:
