@@ -20,7 +20,7 @@ from detectors.incremental.regions import ColumnRegion, Rect
 
 LIMIT_MB = 120.0
 """Default limit of an image's stored activations; beyond it, more is recomputed around the regions."""
-MAX_COST_SHARE = 0.95
+MAX_COST_SHARE = 0.85
 """Cost relative to a whole pass from which a whole pass is used: it has fewer calls and copies than its cost
 suggests.
 """

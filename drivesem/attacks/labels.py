@@ -234,9 +234,12 @@ class Labeller:
         placed = np.stack([cos * x + sin * z, y, cos * z - sin * x], axis=1) + translation[:, :, None]
         nets = self._matrix[:, :3] @ placed + self._matrix[:, 3:]
         same = objects.mesh_index is self.base.objects.mesh_index
-        meshes = [scene.meshes[index] for index in (self._mesh_index if same else objects.mesh_index.tolist())]
-        boxes = [self._projected_mesh(mesh).image_box(net) for mesh, net in zip(meshes, nets, strict=True)]
-        return np.array(boxes, dtype=np.float64).reshape(-1, 4)
+        index = np.array(self._mesh_index if same else objects.mesh_index.tolist(), dtype=np.int64)
+        boxes = np.zeros((len(index), 4))
+        for number in set(index.tolist()):
+            rows = np.flatnonzero(index == number)
+            boxes[rows] = self._projected_mesh(scene.meshes[number]).image_boxes(nets[rows])
+        return boxes
 
 
 def visible_boxes(render: Render) -> Tensor:
@@ -382,16 +385,21 @@ class _ProjectedMesh:
         faces = inverse.reshape(-1)[mesh.faces.cpu().numpy()]
         return cls(np.ascontiguousarray(along.T), np.ascontiguousarray(across.T), faces)
 
-    def image_box(self, net: Array) -> tuple[float, ...]:
-        """Tight box xyxy px under a lattice (3, 64) in clip space; zeros where all is behind the near plane."""
-        slices = net.reshape(-1, _SLICE) @ self.across
-        clip = np.einsum("cik,ik->ck", slices.reshape(3, LATTICE[0], -1), self.along)
-        if not clip.shape[1] or clip[2].min() < _NEAR_M:
-            clip = self._in_front(clip)
-            if not clip.shape[1]:
-                return (0.0, 0.0, 0.0, 0.0)
-        pixels = clip[:2] / clip[2]
-        return (*pixels.min(axis=1).tolist(), *pixels.max(axis=1).tolist())
+    def image_boxes(self, nets: Array) -> Array:
+        """Tight boxes xyxy (M, 4) px under lattices (M, 3, 64) in clip space; zeros where all is behind the near
+        plane.
+        """
+        slices = (nets.reshape(-1, _SLICE) @ self.across).reshape(-1, 3, LATTICE[0], self.along.shape[1])
+        clip = np.einsum("mcik,ik->mck", slices, self.along)
+        if not clip.shape[2]:
+            return np.zeros((len(nets), 4))
+        pixels = clip[:, :2] / np.maximum(clip[:, 2:], _NEAR_M)
+        boxes = np.concatenate([pixels.min(axis=2), pixels.max(axis=2)], axis=1)
+        for row in np.flatnonzero(clip[:, 2].min(axis=1) < _NEAR_M):
+            front = self._in_front(clip[row])
+            pixels = front[:2] / front[2]
+            boxes[row] = [*pixels.min(axis=1), *pixels.max(axis=1)] if front.shape[1] else 0.0
+        return boxes
 
     def _in_front(self, clip: Array) -> Array:
         """Vertices (3, K') in front of the near plane, and intersections of the edges with it."""

@@ -13,6 +13,7 @@ by quantiles, which rain drops and reflections do not move. A uniform object has
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -46,8 +47,8 @@ def _linear_levels() -> Array:
     return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
 
 
-_LINEAR = _linear_levels()
-"""Linear light (256,) of sRGB's levels (IEC 61966-2-1), as a share of white."""
+_WEIGHTED = _LUMINANCE[:, None] * _linear_levels()
+"""Luminance (3, 256) of sRGB's levels (IEC 61966-2-1) of red, green and blue, as a share of white."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +74,7 @@ class ObjectSurround:
         )
         own = render.object_id[where].cpu().numpy() == i + 1
         reach = 2 * max(1, margin // step) + 1
-        near = cv2.dilate(own.view(np.uint8), np.ones((reach, reach), np.uint8))
+        near = cv2.dilate(own.view(np.uint8), _square(reach))
         return cls(where, own, near.view(np.bool_) & ~own)
 
 
@@ -82,18 +83,26 @@ def compute_contrasts(render: Render) -> Array:
 
     Colours are rounded to 8 bits first, as in the written picture, so that a gradient pass gives the same result.
     """
-    image, contrasts = render.image.detach().cpu().numpy(), np.zeros(len(render.opacity))
-    for i in range(len(contrasts)):
-        pixels = ObjectSurround.from_render(render, i)
-        light = luminance(image[:, *pixels.where])
-        contrasts[i] = contrast_between(light[pixels.own], light[pixels.around])
-    return contrasts
+    image = render.image.detach().cpu().numpy()
+    surrounds = [ObjectSurround.from_render(render, i) for i in range(len(render.opacity))]
+    parts = [image[:, *s.where][:, flags] for s in surrounds for flags in (s.own, s.around)]
+    if not parts:
+        return np.zeros(0)
+    # At once: most of the time of so few pixels goes into calls.
+    ends = np.cumsum([part.shape[1] for part in parts])
+    light = np.split(luminance(np.concatenate(parts, axis=1)), ends[:-1])
+    return np.array([contrast_between(*pair) for pair in zip(light[::2], light[1::2], strict=True)])
+
+
+@cache
+def _square(side: int) -> NDArray[np.uint8]:
+    return np.ones((side, side), np.uint8)
 
 
 def luminance(rgb: NDArray[np.floating[Any]]) -> Array:
     """Luminance (...), as a share of white, of display colours (3, ...) in [0, 1], rounded to 8 bits."""
-    levels = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    return np.tensordot(_LUMINANCE, _LINEAR[levels], axes=1)
+    red, green, blue = np.rint(np.minimum(np.maximum(rgb, 0), 1) * 255).astype(np.uint8)
+    return _WEIGHTED[0][red] + _WEIGHTED[1][green] + _WEIGHTED[2][blue]
 
 
 def contrast_between(own: Array, around: Array) -> float:
@@ -105,8 +114,9 @@ def contrast_between(own: Array, around: Array) -> float:
     if not (len(own) and len(around)):
         return 0.0
     inside, outside = (np.sort(part)[(_QUANTILES * len(part)).astype(np.int64)] for part in (own, around))
-    difference = max(np.abs(inside - outside).mean(), np.abs(inside - inside[len(inside) // 2]).mean())
-    return float(difference / (0.5 * (own.mean() + around.mean()) + FLARE))
+    differences = np.abs(inside - np.stack([outside, inside[[len(inside) // 2] * len(inside)]])).sum(axis=1)
+    adapted = 0.5 * (own.sum() / len(own) + around.sum() / len(around))
+    return float(differences.max() / len(inside) / (adapted + FLARE))
 
 
 _PIXELS = 96
