@@ -1083,20 +1083,41 @@ def _attributes_to_clip(
     centre = _centre_hit(pixels, vertices, i)
     each = ONE / wp.float64(SUBPIXEL_COUNT)
     total = ZERO
+    last = centre.hit
+    s = _corner_products(vertices, last, g)
+    q0 = wp.vec3d(ZERO, ZERO, ZERO)
+    q1 = wp.vec3d(ZERO, ZERO, ZERO)
+    q2 = wp.vec3d(ZERO, ZERO, ZERO)
     k = int(0)
     while k < SUBPIXEL_COUNT:
         spot = _subpixel_hit(centre, pixels.face[i], k, vertices)
         hit = spot.hit
-        s0 = _attributes_dot(g, vertices.own[hit.i0])
-        s1 = _attributes_dot(g, vertices.own[hit.i1])
-        s2 = _attributes_dot(g, vertices.own[hit.i2])
-        mean = hit.b[0] * s0 + hit.b[1] * s1 + hit.b[2] * s2
+        if hit.i0 != last.i0 or hit.i1 != last.i1 or hit.i2 != last.i2:
+            add_corner_gradients(last, q0, q1, q2, grads.clip)
+            q0 = wp.vec3d(ZERO, ZERO, ZERO)
+            q1 = wp.vec3d(ZERO, ZERO, ZERO)
+            q2 = wp.vec3d(ZERO, ZERO, ZERO)
+            last = hit
+            s = _corner_products(vertices, last, g)
+        mean = wp.dot(hit.b, s)
         total += mean * each
-        if share != 0.0:
-            q = _scaled_pixel(hit, spot.x, spot.y) * (wp.float64(share) * each)
-            add_corner_gradients(hit, q * (s0 - mean), q * (s1 - mean), q * (s2 - mean), grads.clip)
+        q = _scaled_pixel(hit, spot.x, spot.y) * (wp.float64(share) * each)
+        q0 += q * (s[0] - mean)
+        q1 += q * (s[1] - mean)
+        q2 += q * (s[2] - mean)
         k += 1
+    add_corner_gradients(last, q0, q1, q2, grads.clip)
     return wp.float32(total)
+
+
+@wp.func
+def _corner_products(vertices: Vertices, hit: TriangleHit, g: attributes_t):
+    """Dot products of a gradient with the attributes of a face's corners."""
+    return wp.vec3d(
+        _attributes_dot(g, vertices.own[hit.i0]),
+        _attributes_dot(g, vertices.own[hit.i1]),
+        _attributes_dot(g, vertices.own[hit.i2]),
+    )
 
 
 @wp.func
@@ -1287,6 +1308,11 @@ def complete_backward_kernel(
     i = wp.int32(need[start + wp.tid()])
     if i < 0:
         return
+    g = _layer_gradient(lookups, to_layers, i, i) * pixels.coverage[i]
+    if not final:
+        g = grads.mesh[i]
+    if g[0] == 0.0 and g[1] == 0.0 and g[2] == 0.0 and g[3] == 0.0:  # such as behind another vehicle
+        return
     at = pixels.table[i]
     o = at[0]
     v = _blended_attributes(pixels, vertices, i)
@@ -1295,9 +1321,6 @@ def complete_backward_kernel(
     eye = _to_eye(photograph, at)
     facing = a[ch.TURNED] + a[ch.COS_THEN]
     c = _complete(v, facing, texel.value, photograph.turn[o], eye, photograph.sun[o], photograph.frame_wh[o])
-    g = _layer_gradient(lookups, to_layers, i, i) * pixels.coverage[i]
-    if not final:
-        g = grads.mesh[i]
     f = lookups.unseen[i]
     to_colour = wp.vec3f(g[0] * f, g[1] * f, g[2] * f)
     grads.unseen[i] = grads.unseen[i] + g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3]
