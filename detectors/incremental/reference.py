@@ -22,7 +22,7 @@ LIMIT_MB = 120.0
 """Default limit of an image's stored activations; beyond it, more is recomputed around the regions."""
 MAX_COST_SHARE = 0.85
 """Cost relative to a whole pass from which a whole pass is used: it has fewer calls and copies than its cost
-suggests.
+suggests. Measured on KITTI's boxes, both take equally long there.
 """
 MAX_LOGIT_DIFFERENCE = 1e-3
 """Largest difference of logits from a whole pass in the first comparison."""
