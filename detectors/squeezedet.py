@@ -324,7 +324,9 @@ class SqueezeDet(Detector):
         like = raw.deltas
         cells, cpu = grid.grid_size(raw.image_hw), torch.device("cpu")
         anchors_xyxy = grid.anchors_xyxy(self.anchors, *cells, like.dtype, like.device)
-        anchors = [make(self.anchors, *cells, like.dtype, cpu) for make in (grid.anchors_cxcywh, grid.anchors_xyxy)]
+        anchors = [
+            make(self.anchors, *cells, like.dtype, cpu) for make in (grid.anchors_cxcywh, grid.anchors_xyxy)
+        ]
         negative = torch.ones(raw.confidence_logits.shape, dtype=torch.bool, device=like.device)
         matched = torch.zeros_like(negative)
         image, anchor, true_boxes, labels, matches = [], [], [], [], []

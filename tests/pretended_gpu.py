@@ -19,7 +19,7 @@ import pytest
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_leaves
 
 from scene_ir.raster import launch
@@ -48,7 +48,9 @@ _COPIES = ("aten::copy_", "aten::_to_copy", "aten::_copy_from")
 _NO_SCALARS = ("aten::cat", "aten::stack")
 _WAITS = {f"aten::{name}" for name in ("equal", "nonzero", "masked_select", "bincount", "_unique2", "unique_dim")}
 """What the processor waits for: it needs the value, or the size, of the result."""
-_NO_KERNEL = {f"aten::{name}" for name in ("empty", "empty_like", "new_empty", "empty_strided", "detach", "record")}
+_NO_KERNEL = {
+    f"aten::{name}" for name in ("empty", "empty_like", "new_empty", "empty_strided", "detach", "record")
+}
 _ROOT = f"{Path(__file__).parents[1]}/"
 
 
@@ -114,7 +116,7 @@ class _Move(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, where: torch.device, waits: bool = True) -> Tensor:
         ctx.back = place(tensor)
-        with torch.utils._python_dispatch._disable_current_modes():
+        with _disable_current_modes():
             moved = tensor.clone()
         _count_copy(waits)
         _put(moved, where)

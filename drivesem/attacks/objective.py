@@ -416,8 +416,8 @@ def _compute_batch(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tens
 
 
 def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[tuple[Tensor, float]]:
-    """The loss () of each objective at its theta (D,), differentiable, and its value; all share one detector. Scores seen on the
-    way are cached for `Objective.preview`.
+    """The loss () of each objective at its theta (D,), differentiable, and its value; all share one detector. Scores
+    seen on the way are cached for `Objective.preview`.
     """
     scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
     renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])

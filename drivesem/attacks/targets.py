@@ -58,7 +58,9 @@ class EvaluatedClasses:
     def map_detections(self, detections: Detections) -> Detections:
         """Detections of the evaluated classes, on the CPU; labels change from the detector's own to `names`."""
         if detections.scores.is_cuda:
-            detections = Detections(*(t.cpu() for t in (detections.boxes_xyxy, detections.labels, detections.scores)))
+            detections = Detections(
+                *(t.cpu() for t in (detections.boxes_xyxy, detections.labels, detections.scores))
+            )
         if self.detector_classes == self.names:
             return detections
         labels = _index_map(self.detector_classes, self.names)[detections.labels]

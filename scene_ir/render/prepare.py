@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene_ir.meshes.lod import level_of_detail
 from scene_ir.geometry import to_clip
+from scene_ir.meshes.lod import level_of_detail
 from scene_ir.raster import verbs
 from scene_ir.raster.layout import TensorCache
 from scene_ir.render import blend, channels, finish, model, surfaces, texture
