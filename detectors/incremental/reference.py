@@ -20,9 +20,9 @@ from detectors.incremental.regions import ColumnRegion, Rect
 
 LIMIT_MB = 120.0
 """Default limit of an image's stored activations; beyond it, more is recomputed around the regions."""
-MAX_COST_SHARE = 0.85
+MAX_COST_SHARE = 0.95
 """Cost relative to a whole pass from which a whole pass is used: it has fewer calls and copies than its cost
-suggests. Measured on KITTI's boxes, both take equally long there.
+suggests.
 """
 MAX_LOGIT_DIFFERENCE = 1e-3
 """Largest difference of logits from a whole pass in the first comparison."""
