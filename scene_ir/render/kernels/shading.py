@@ -957,26 +957,28 @@ def shade_backward_kernel(
         g = g * pixels.coverage[i]
         if not final:
             g = grads.mesh[i]
-        texel = _texel_with_slopes(photograph, at[0], uv)
-        c = texel.value
-        to_lookup = lookup_t()
-        to_texel = texel_t()
-        to_texel[ch.ALPHA] = g[3]
-        for k in range(3):
-            to_texel[k] = g[k] * _relight_slope(c[k], a[ch.BRIGHTER])
-            to_lookup[ch.BRIGHTER] += g[k] * c[k] * (1.0 - c[k] * c[k])
-        # Where opacity changes along a surface that turned, so does the share of exposed outline.
-        even = (
-            a[ch.TURNED] <= OPEN_TURN[0]
-            or wp.max(wp.abs(texel.to_u[ch.ALPHA]), wp.abs(texel.to_v[ch.ALPHA])) <= EVEN_SLOPE
-        )
-        if not (even and _is_plainly_visible(a, texel.value, uv[0], uv[1], wh)):
-            to_lookup, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(_mesh_loss)(
-                a, texel.value, xy, wh, g, grads.unseen[i]
+        # Else nothing depends on it, such as behind another vehicle.
+        if grads.unseen[i] != 0.0 or g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
+            texel = _texel_with_slopes(photograph, at[0], uv)
+            c = texel.value
+            to_lookup = lookup_t()
+            to_texel = texel_t()
+            to_texel[ch.ALPHA] = g[3]
+            for k in range(3):
+                to_texel[k] = g[k] * _relight_slope(c[k], a[ch.BRIGHTER])
+                to_lookup[ch.BRIGHTER] += g[k] * c[k] * (1.0 - c[k] * c[k])
+            # Where opacity changes along a surface that turned, so does the share of exposed outline.
+            even = (
+                a[ch.TURNED] <= OPEN_TURN[0]
+                or wp.max(wp.abs(texel.to_u[ch.ALPHA]), wp.abs(texel.to_v[ch.ALPHA])) <= EVEN_SLOPE
             )
-        to_lookup[ch.DISPLACEMENT] += wp.dot(to_texel, texel.to_u)
-        to_lookup[ch.DISPLACEMENT + 1] += wp.dot(to_texel, texel.to_v)
-        wp.atomic_add(grads.lookup, i, to_lookup)
+            if not (even and _is_plainly_visible(a, texel.value, uv[0], uv[1], wh)):
+                to_lookup, to_texel, to_xy, to_wh, to_g, to_f = wp.grad(_mesh_loss)(
+                    a, texel.value, xy, wh, g, grads.unseen[i]
+                )
+            to_lookup[ch.DISPLACEMENT] += wp.dot(to_texel, texel.to_u)
+            to_lookup[ch.DISPLACEMENT + 1] += wp.dot(to_texel, texel.to_v)
+            wp.atomic_add(grads.lookup, i, to_lookup)
     if _in_halo(pixels, i):
         j = wp.int32(pixels.nearest[i])
         b = lookups.lookup[j]
