@@ -168,7 +168,7 @@ def _solve_scene(
         drawn.mesh.layout.rects[i].tolist() if i < count else _crop_rect(mattes[i]) for i in range(len(mattes))
     ]
     for level in _layer_levels(order, rects, mattes):
-        shown: list[int] = []
+        touched: list[int] = []
         for i in level:
             nearer = torch.zeros(frame_hw, dtype=torch.bool)
             later = order[order.index(i) + 1 :]
@@ -186,11 +186,11 @@ def _solve_scene(
             foreground = _solve_foreground(mattes[i], image, canvas, nearer, coverage)
             solved[i] = replace(blank[i], foreground=foreground, shadow=lit[i])
             if any(_touches(rects[i], mattes[j]) for j in later):  # one of them is solved against it
-                shown.append(i)
-        if shown:
-            some = replace(_select_objects(objects, shown), source=tuple(solved[i] for i in shown))
+                touched.append(i)
+        if touched:
+            some = replace(_select_objects(objects, touched), source=tuple(solved[i] for i in touched))
             part = replace(scene, background=canvas, objects=some, occluders=())
-            hidden = [behind_nearer[i] for i in shown]
+            hidden = [behind_nearer[i] for i in touched]
             canvas = _composite_objects(Compositor(part, RenderSettings(settings.backend), hidden=hidden))
     sources = tuple(solved[i] for i in range(count))
     return replace(scene, background=background, objects=replace(objects, source=sources), occluders=tuple(front))
