@@ -249,12 +249,11 @@ def _relative(path: str) -> str:
 
 
 def measure_batches(device: str) -> dict[str, Any]:
-    """Milliseconds of thetas of one frame through renderer and detector, together and one by one; of gradients
-    together; and of a certificate's draws.
+    """Milliseconds of thetas of one frame through renderer and detector, together and one by one, and of a
+    certificate's draws.
     """
     import torch
 
-    from drivesem.attacks.objective import compute_gradients
     from drivesem.bench.timing import PairedTimer, Spread
     from drivesem.failures.certificate import CompositorRenderer, NuisanceCamera
     from drivesem.failures.nuisances import Nuisances
@@ -287,8 +286,7 @@ def measure_batches(device: str) -> dict[str, Any]:
 
     def certify() -> None:
         for state in (states[0], base):
-            for number in range(_DRAWS):
-                camera.evaluate(state, number, ignore)
+            camera.evaluate_all(state, range(_DRAWS), ignore)
 
     calls: dict[str, Callable[[], object]] = {
         "thetas_64": partial(detect_together, _BATCH),
@@ -297,7 +295,6 @@ def measure_batches(device: str) -> dict[str, Any]:
         "thetas_16": partial(detect_together, _BATCH // 4),
         "certificate_32_draws": certify,
         "nuisance_render": lambda: camera.render(states[0], 0, ignore),
-        "gradients_8": lambda: compute_gradients([objective] * 8, thetas[:8]),
         "scenes_at_64_thetas": lambda: [space.apply(base, theta) for theta in thetas],
     }
     out: dict[str, Any] = {"cars": _CARS}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,7 +18,6 @@ from detectors.base import (
     Predictor,
     explain_missing_gradient,
     predict,
-    run_in_halves,
 )
 from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.incremental.regions import Rect
@@ -36,9 +35,9 @@ from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import failures
 from drivesem.failures.fidelity import find_untrusted
 from scene_ir import ffd
-from scene_ir.errors import RangeError, ShapeError
+from scene_ir.errors import RangeError
 from scene_ir.io import round_to_8bit
-from scene_ir.render.compositor import Compositor, render_batch
+from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Render, SceneIR
 
@@ -145,18 +144,33 @@ class Objective:
 
     def __call__(self, theta: Tensor) -> Tensor:
         """The loss () at theta (D,), differentiable. Raises RangeError where it is not finite."""
-        return _compute_losses([self], [theta])[0][0]
+        return self._compute_loss(theta)[0]
 
     def loss_and_grad(self, theta: Tensor, feasible: FeasibleSet | None = None) -> tuple[float, Tensor]:
         """Loss and its gradient (D,) at theta (D,), for the coordinates that `feasible` leaves free. Raises
         RangeError naming the coordinate where either is not finite.
         """
         leaf = theta.detach().clone().requires_grad_(True)
-        ((loss, value),) = _compute_losses([self], [leaf])
+        loss, value = self._compute_loss(leaf)
         (gradient,) = torch.autograd.grad(loss, leaf)
         self.passes += GRADIENT_PASSES
         self.space.check_gradient(gradient)
         return value, gradient if feasible is None else feasible.project_gradient(theta, gradient)
+
+    def _compute_loss(self, theta: Tensor) -> tuple[Tensor, float]:
+        """The loss () at theta (D,), differentiable, and its value. The score seen on the way is cached for
+        `preview`.
+        """
+        scene = self.space.apply(self.space.scene, theta)
+        render = self.compositor.render(scene)
+        detector, raw = self.differentiable, self.predict(render)
+        moved = self.labeller.moved(scene, render)
+        labels = moved if self.label_mode == "moved" else self.labeller.paper()
+        loss, value = self.compute_loss(detector, raw, labels.targets)
+        with torch.no_grad():
+            detections = self.classes.map_detections(_decode(detector, raw))
+        self.previews[_key(theta)] = self.score_image(value, moved, detections)
+        return loss, value
 
     @torch.no_grad()
     def evaluate(self, theta: Tensor) -> RenderEvaluation:
@@ -380,71 +394,6 @@ class Objective:
     def _check_term(self, terms: Collection[str]) -> None:
         if self.term not in terms:
             raise RangeError("objective term", f"one of {', '.join(terms)}", repr(self.term))
-
-
-def compute_gradients(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:
-    """Losses and gradients at several thetas in one step, of one scene or of several.
-
-    Args:
-        objectives: one for each theta, all of one detector.
-        thetas: (D,) each.
-
-    Returns:
-        Loss () and gradient (D,) at each theta. Split in halves where the device's memory cannot hold all at once.
-
-    Raises:
-        RangeError: there is no objective, they have several detectors, or a loss or gradient is not finite.
-        ShapeError: the numbers of thetas and objectives differ.
-    """
-    detectors = {id(objective.detector) for objective in objectives}
-    if len(detectors) != 1:
-        raise RangeError("objectives", "one detector for all", f"{len(detectors)} detectors")
-    if len(thetas) != len(objectives):
-        raise ShapeError("thetas", f"{len(objectives)}, one for each objective", len(thetas))
-    return run_in_halves(_compute_batch, list(zip(objectives, thetas, strict=True)), "thetas")
-
-
-def _compute_batch(pairs: Sequence[tuple[Objective, Tensor]]) -> list[tuple[Tensor, Tensor]]:
-    objectives, thetas = zip(*pairs, strict=True)
-    leaves = [theta.detach().clone().requires_grad_(True) for theta in thetas]
-    batch_losses = [loss for loss, _ in _compute_losses(objectives, leaves)]
-    gradients = torch.autograd.grad(batch_losses, leaves)
-    for objective, gradient in zip(objectives, gradients, strict=True):
-        objective.passes += GRADIENT_PASSES
-        objective.space.check_gradient(gradient)
-    return [(loss.detach(), gradient) for loss, gradient in zip(batch_losses, gradients, strict=True)]
-
-
-def _compute_losses(objectives: Sequence[Objective], thetas: Sequence[Tensor]) -> list[tuple[Tensor, float]]:
-    """The loss () of each objective at its theta (D,), differentiable, and its value; all share one detector. Scores
-    seen on the way are cached for `Objective.preview`.
-    """
-    scenes = [o.space.apply(o.space.scene, theta) for o, theta in zip(objectives, thetas, strict=True)]
-    renders = render_batch([(o.compositor, scene) for o, scene in zip(objectives, scenes, strict=True)])
-    predictions: dict[int, AnchorPredictions] = {}
-    whole_images: dict[torch.Size, list[int]] = {}
-    for i, (objective, render) in enumerate(zip(objectives, renders, strict=True)):
-        region_predictions = objective.predict_regions(render)
-        if region_predictions is None:
-            whole_images.setdefault(render.image.shape, []).append(i)
-        else:
-            predictions[i] = region_predictions
-    for rows in whole_images.values():
-        images = [renders[i].image for i in rows]
-        raw = objectives[rows[0]].differentiable(images[0][None] if len(images) == 1 else torch.stack(images))
-        # One by one: the loss of a batch is a mean over its images, weighted by their objects.
-        predictions |= {i: raw.select(row) for row, i in enumerate(rows)}
-    batch_losses = []
-    for i, (objective, theta) in enumerate(zip(objectives, thetas, strict=True)):
-        detector, raw = objective.differentiable, predictions[i]
-        moved = objective.labeller.moved(scenes[i], renders[i])
-        labels = moved if objective.label_mode == "moved" else objective.labeller.paper()
-        loss, value = objective.compute_loss(detector, raw, labels.targets)
-        with torch.no_grad():
-            detections = objective.classes.map_detections(_decode(detector, raw))
-        objective.previews[_key(theta)] = objective.score_image(value, moved, detections)
-        batch_losses.append((loss, value))
-    return batch_losses
 
 
 def _decode(detector: Detector, raw: AnchorPredictions) -> Detections:

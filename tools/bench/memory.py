@@ -19,7 +19,7 @@ from tools.bench.probe import ProbeOrder, ResidentMemory, probe
 TITLE = "Memory"
 COLUMNS: Columns = {
     "sweep": ("against", "against"), "cars": ("cars", "cars"), "triangles": ("triangles a car", None),
-    "batch": ("batch", "batch"), "steps": ("steps", "steps"), "peak_mb": ("peak, MB", "peak MB"),
+    "steps": ("steps", "steps"), "peak_mb": ("peak, MB", "peak MB"),
     "detector_mb": ("detector alone, MB", "detector"), "above_mb": ("above it, MB", "above"),
     "libraries_mb": ("of which libraries, MB", "libraries"), "rss_10": ("after 10 steps, MB", "at 10"),
     "rss_100": ("after 100, MB", "at 100"), "rss_1000": ("after 1,000, MB", "at 1000"),
@@ -35,8 +35,7 @@ METHOD = (
 )
 QUICK_STEPS, FULL_STEPS = 100, 1000
 _SWEEP_STEPS = 12
-"""Steps of a row that is about cars or batch: the peak is reached in the first."""
-_BATCHES = (2, 4, 8)
+"""Steps of a row that is about cars: the peak is reached in the first."""
 _KB = 1024.0
 _ASKER = "bench memory"
 
@@ -46,10 +45,9 @@ class MemoryRow:
     """Memory of one case; MB unless noted."""
 
     sweep: str
-    """What this row is about, cars, batch or steps."""
+    """What this row is about, cars or steps."""
     cars: int
     triangles: int
-    batch: int
     steps: int
     peak_mb: float
     detector_mb: float
@@ -68,17 +66,14 @@ class MemoryCase:
     sweep: str
     cars: int
     triangles: int
-    batch: int = 1
     steps: int = _SWEEP_STEPS
 
 
 def cases(cars: Sequence[int], triangles: Sequence[int], quick: bool) -> list[MemoryCase]:
-    """Against cars; against batch, where attacks have one; and against steps, at the usual size."""
+    """Against cars; and against steps, at the usual size."""
     usual, most = (8 if 8 in cars else max(cars)), max(triangles)
-    batches = _BATCHES[:1] if quick else _BATCHES
     return [
         *(MemoryCase("cars", n, most) for n in cars),
-        *(MemoryCase("batch", usual, most, batch=b) for b in batches),
         MemoryCase("steps", usual, most, steps=QUICK_STEPS if quick else FULL_STEPS),
     ]
 
@@ -87,15 +82,14 @@ def measure(case_list: Sequence[MemoryCase], seed: int, detector: str) -> Iterat
     """One row a case. Raises FormatError where a process ends without a result."""
     with tempfile.TemporaryDirectory(prefix="drivesem-bench-") as name:
         folder = Path(name)
-        alone: dict[int, ResidentMemory] = {}
+        alone: ResidentMemory | None = None
         for case in case_list:
             scene = folder / f"{case.cars}x{case.triangles}"
             if not scene.exists():
                 save_scene(build_bench_scene(case.cars, case.triangles, seed).scene, scene)
-            order = ProbeOrder(detector, torch.get_num_threads(), str(scene), case.batch, case.steps, seed)
-            if case.batch not in alone:
-                alone[case.batch] = probe("detector", order, _ASKER)
-            yield _row(case, probe("attack", order, _ASKER), alone[case.batch])
+            order = ProbeOrder(detector, torch.get_num_threads(), str(scene), case.steps, seed)
+            alone = alone or probe("detector", order, _ASKER)
+            yield _row(case, probe("attack", order, _ASKER), alone)
 
 
 def _row(case: MemoryCase, attack: ResidentMemory, alone: ResidentMemory) -> MemoryRow:
@@ -106,7 +100,6 @@ def _row(case: MemoryCase, attack: ResidentMemory, alone: ResidentMemory) -> Mem
         sweep=case.sweep,
         cars=case.cars,
         triangles=case.triangles,
-        batch=case.batch,
         steps=case.steps,
         peak_mb=round(attack.peak_kb / _KB, 1),
         detector_mb=round(alone.peak_kb / _KB, 1),

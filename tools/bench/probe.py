@@ -34,10 +34,10 @@ class ProbeOrder:
     """Of torch."""
     scene: str | tuple[int, int]
     """Its folder, or height and width, px, of a random image for the detector alone."""
-    batch: int = 1
-    """Images or thetas at once; steps; seed."""
     steps: int = _DETECTOR_STEPS
+    """Number of steps."""
     seed: int = 0
+    """Seed of the image or of theta."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def image_gradient(detector: Detector, images: Tensor) -> Tensor:
 
 
 def _detector_alone(order: ProbeOrder) -> ResidentMemory:
-    """The detector's forward and backward on `batch` images, and nothing else of the project."""
+    """The detector's forward and backward on an image, and nothing else of the project."""
     import torch
 
     from detectors.registry import load_detector
@@ -93,7 +93,7 @@ def _detector_alone(order: ProbeOrder) -> ResidentMemory:
         image = torch.from_numpy(read_image(Path(order.scene) / "photograph.png")).permute(2, 0, 1) / 255
     else:
         image = torch.rand(3, *order.scene, generator=torch.Generator().manual_seed(order.seed))
-    images = image[None].repeat(order.batch, 1, 1, 1).contiguous(memory_format=torch.channels_last)
+    images = image[None].contiguous(memory_format=torch.channels_last)
     steps = min(order.steps, _DETECTOR_STEPS)
     return _watched(lambda: image_gradient(detector, images), steps, libraries)
 
@@ -104,7 +104,7 @@ def _attack(order: ProbeOrder) -> ResidentMemory:
 
     from detectors.registry import load_detector
     from drivesem.attacks.feasible.projection import FeasibleSet
-    from drivesem.attacks.objective import Objective, compute_gradients
+    from drivesem.attacks.objective import Objective
     from drivesem.attacks.space import ParameterSpace, combo_parameters
     from scene_ir.io import load_scene
     from scene_ir.render.compositor import Compositor
@@ -116,18 +116,13 @@ def _attack(order: ProbeOrder) -> ResidentMemory:
     objective = Objective(Compositor(scene), space, load_detector(order.detector))
     feasible = FeasibleSet(space)
     generator = torch.Generator().manual_seed(order.seed)
-    noise = torch.rand(order.batch, space.dim, generator=generator)
-    thetas = [feasible.project(space.step * 10 * (2 * row - 1)).theta for row in noise]
+    noise = torch.rand(space.dim, generator=generator)
+    theta = feasible.project(space.step * 10 * (2 * noise - 1)).theta
 
     def step() -> None:
-        if order.batch == 1:
-            gradients = [objective.loss_and_grad(thetas[0])[1]]
-        else:
-            gradients = [gradient for _, gradient in compute_gradients([objective] * len(thetas), thetas)]
-        thetas[:] = [
-            feasible.project(theta + space.step * torch.sign(gradient)).theta
-            for theta, gradient in zip(thetas, gradients, strict=True)
-        ]
+        nonlocal theta
+        _, gradient = objective.loss_and_grad(theta)
+        theta = feasible.project(theta + space.step * torch.sign(gradient)).theta
 
     return _watched(step, order.steps, libraries)
 

@@ -11,10 +11,10 @@ from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.labels import Difficulty
 from drivesem.attacks.methods.gradient_ascent import SiFGSM
 from drivesem.attacks.methods.gradient_free import Sampling
-from drivesem.attacks.objective import Objective, compute_gradients
+from drivesem.attacks.objective import Objective
 from drivesem.attacks.space import ParameterSpace
 from drivesem.config.commands import AttackConfig
-from scene_ir.errors import RangeError, ShapeError
+from scene_ir.errors import RangeError
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Crop, Render
@@ -287,61 +287,6 @@ def _frozen_squeezedet() -> SqueezeDet:
     detector.initialise(torch.Generator().manual_seed(0))
     torch.nn.init.normal_(detector.convdet.weight, std=0.02, generator=torch.Generator().manual_seed(1))
     return detector.eval().requires_grad_(False)
-
-
-def _pattern_objectives(street, detector, sizes) -> list[Objective]:
-    found = []
-    for i, (height, width) in enumerate(sizes):
-        # Scenes of one, two, three objects: a mean over the batch's objects would mix them.
-        scene = street(positions_xz=[(-2.0, 9.0 + i), (2.4, 13.0), (-2.0, 19.0)][: i + 1], dtype=torch.float64)
-        space = ParameterSpace(scene, ("translate",))
-        found.append(Objective(PatternCompositor(height, width), space, detector, difficulty=ALL_TARGETS))
-    return found
-
-
-def test_batched_scenes_are_independent(street):
-    detector = _frozen_squeezedet()
-    objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
-    generator = torch.Generator().manual_seed(3)
-    thetas = [torch.randn(o.space.dim, generator=generator, dtype=torch.float64) / 10 for o in objectives]
-    batch = compute_gradients(objectives, thetas)
-    single = [o.loss_and_grad(theta) for o, theta in zip(objectives, thetas, strict=True)]
-    assert len({round(loss, 3) for loss, _ in single}) == 3
-    for (loss, gradient), (expected_loss, expected) in zip(batch, single, strict=True):
-        assert loss == pytest.approx(expected_loss, rel=1e-6)
-        assert float(expected.norm()) > 0
-        assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm())
-
-
-def test_images_of_one_size_share_a_detector_pass(street):
-    detector = _frozen_squeezedet()
-    objectives = _pattern_objectives(street, detector, [(64, 96), (48, 80), (64, 96)])
-    seen = []
-    detector.register_forward_hook(lambda _module, inputs, _output: seen.append(tuple(inputs[0].shape)))
-    compute_gradients(objectives, [o.space.theta0 for o in objectives])
-    assert seen == [(2, 3, 64, 96), (1, 3, 48, 80)]
-
-
-def test_batched_thetas_are_independent(street):
-    objective = _real(street(positions_xz=NEAR, dtype=torch.float64), ("translate", "color"))
-    space = objective.space
-    noise = torch.randn(3, space.dim, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    thetas = space.theta0 + 0.5 * space.step * noise
-    for theta, (loss, gradient) in zip(thetas, compute_gradients([objective] * 3, thetas), strict=True):
-        expected_loss, expected = objective.loss_and_grad(theta)
-        assert float(loss) == pytest.approx(expected_loss, rel=1e-6)
-        assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm())
-
-
-def test_invalid_batches_are_refused(street):
-    scene = street(positions_xz=NEAR)
-    first, second = (_objective(scene, StubDetector(scene.objects.box2d)) for _ in range(2))
-    with pytest.raises(RangeError, match="objectives: expected one detector for all, found 2 detectors"):
-        compute_gradients([first, second], [first.space.theta0] * 2)
-    with pytest.raises(RangeError, match="objectives: expected one detector for all, found 0 detectors"):
-        compute_gradients([], [])
-    with pytest.raises(ShapeError, match=r"thetas: expected 1, one for each objective, found 2"):
-        compute_gradients([first], [first.space.theta0] * 2)
 
 
 def test_a_gradient_pass_previews_the_score(street):
