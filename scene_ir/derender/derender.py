@@ -340,8 +340,8 @@ def _cut_out_vehicles(
         draft = _draft_cutout(row, frame, box, photograph, segmenter, row in fitted_rows)
         if draft is not None:
             drafts.append(draft)
-    if not settings.known_placements:
-        tall = [draft for draft in drafts if draft.row in fitted_rows]
+    tall = [draft for draft in drafts if draft.row in fitted_rows]
+    if tall and not settings.known_placements:
         tall = _fit_drafts(tall, picture, _trusted_boxes(labels, [d.row for d in tall], camera), segmenter)
         drafts = [*tall, *(draft for draft in drafts if draft.row not in fitted_rows)]
         drafts.sort(key=lambda draft: order.index(draft.row))
