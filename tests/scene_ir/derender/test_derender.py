@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from scene_ir.derender import silhouette
-from scene_ir.derender.derender import DerenderSettings, derender
+from scene_ir.derender.derender import DerenderSettings, derender, place_vehicles
 from scene_ir.derender.silhouette import Placement
 from scene_ir.errors import RangeError, ShapeError
 from scene_ir.render.compositor import Compositor
@@ -258,3 +258,25 @@ def test_a_2d_box_counts_only_where_it_is_not_the_3d_boxs_own_picture(street):
     assert _trusted_boxes(replace(labels, boxes_xyxy=drawn), [0], camera).trust.tolist() == [[0.0, 1.0, 0.0, 0.0]]
     hidden = replace(labels, occlusion=torch.tensor([2]))
     assert _trusted_boxes(hidden, [0], camera).trust.tolist() == [[0.0, 0.0, 0.0, 0.0]]
+
+
+def test_a_vehicle_too_low_to_be_evaluated_is_not_fitted(street, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted: list[int] = []
+    fit = silhouette.fit_silhouettes
+
+    def count(placements, *rest):
+        fitted.append(len(placements))
+        return fit(placements, *rest)
+
+    monkeypatch.setattr(silhouette, "fit_silhouettes", count)
+    labels = street.frame.labels
+    assert labels is not None
+    heights = labels.boxes_xyxy[:, 3] - labels.boxes_xyxy[:, 1]
+    placed = place_vehicles(street.frame, DerenderSettings())
+    assert fitted == [len(placed)]
+    limit = float(heights[list(placed)].max()) + 1
+    low = place_vehicles(street.frame, DerenderSettings(min_fit_px=limit))
+    assert fitted == [len(placed)]
+    assert set(low) == set(placed)
+    assert not any(bool(placement.ffd.any()) for placement in low.values())
+    assert any(bool(placement.ffd.any()) for placement in placed.values())
