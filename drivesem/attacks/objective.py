@@ -227,8 +227,9 @@ class Objective:
         key = _key(theta)
         if key not in self._scores:
             rendered = self.evaluate(theta)
+            passes = 0 if rendered is self.benign else 1
             self._scores[key] = self.score_image(
-                rendered.loss, rendered.moved, rendered.detections, rendered.render.image
+                rendered.loss, rendered.moved, rendered.detections, rendered.render.image, passes
             )
         return self._scores[key]
 
@@ -239,7 +240,7 @@ class Objective:
         return self.previews.get(_key(theta))
 
     def score_image(
-        self, loss: float, moved: SceneLabels, detections: Detections, image: Tensor, passes: int = 1
+        self, loss: float, moved: SceneLabels, detections: Detections, image: Tensor, passes: int
     ) -> Score:
         """The score of a state, which enters the search log.
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 from drivesem.failures.feature_cells import CELL_EDGES, LEVEL_NAMES, Cell, CellVisit
 from drivesem.reporting.tables import format_count
@@ -85,6 +85,11 @@ class FailureMap:
         states = [cell.state for cell in by_cell.values()]
         counts = (states.count("failing"), states.count("clear"), len(frames) - len(known))
         return cls(tuple(by_cell.values()), len(by_cell), *counts)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a JSON object."""
+        data = asdict(self)
+        return data | {"cells": list(data["cells"])}
 
     @property
     def columns(self) -> list[tuple[str, str]]:

@@ -295,7 +295,7 @@ class RunSummary:
             "broken": dataclasses.asdict(self.broken),
             "objects": dataclasses.asdict(self.objects),
             "missed_before": dataclasses.asdict(self.missed_before),
-            "map": dataclasses.asdict(self.map),
+            "map": self.map.to_json(),
             "lost_by_grade": {grade: dataclasses.asdict(share) for grade, share in self.lost_by_grade.items()},
             "benign": self.benign.to_json(),
             "rerendered": self.rerendered.to_json(),

@@ -2,7 +2,9 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -16,6 +18,7 @@ from drivesem.failures.certificate import (
     NuisanceCamera,
     SampleOutcome,
     certify,
+    count_samples,
 )
 from drivesem.failures.grades import Certificate, Kind
 from drivesem.failures.kinds import DetectionOutcome, Fault, LabelledDetections
@@ -102,6 +105,28 @@ def test_no_more_samples_than_decide() -> None:
     count, taken = counted(LOST, [FOUND] * 16, [FOUND] * 16)
     assert (taken, count) == (5, Certificate(0, 0, 0, 5, None, count.margin_after))
     assert counted(LOST, [GONE] * 16, [GONE] * 16)[1] == 16 + 2
+
+
+@pytest.mark.parametrize(("missed", "saved"), [(0.1, 25), (0.5, 20), (0.95, 0)])
+def test_stopping_early_saves_draws_and_changes_no_verdict(missed: float, saved: int) -> None:
+    """Against all 32 draws of the same changes, among them placebos, in which chance alone decides."""
+    rng, rule = np.random.default_rng(0), CertificateRule()
+    false_early = false_full = draws = 0
+    for _ in range(400):
+        wrong, right = rng.random(rule.draws) < missed, rng.random(rule.draws) < 0.99
+
+        def judge(
+            changed: bool, number: int, rows: Sequence[int], wrong: Any = wrong, right: Any = right
+        ) -> list[tuple[bool, float | None]]:
+            return [(bool((wrong if changed else right)[number]), None) for _ in rows]
+
+        (count,) = count_samples(1, judge, rule)
+        full = wrong.sum() >= rule.after and right.sum() >= rule.before
+        assert rule.holds(count) is bool(full)
+        false_early, false_full = false_early + rule.holds(count), false_full + bool(full)
+        draws += count.before_draws + count.after_draws
+    assert false_early == false_full
+    assert 2 * rule.draws - draws / 400 >= saved
 
 
 def test_twice_and_background() -> None:
