@@ -22,7 +22,12 @@ CLEAR_BELOW = 0.1
 CellState = Literal["failing", "clear", "missed", "unknown"]
 """failing: certain failures; clear: none, and a bound under `CLEAR_BELOW`; missed: misses that are not certain;
 unknown: no miss, but too few frames."""
-CELLS = tuple(itertools.product(*(range(len(edges) + 1) for edges in CELL_EDGES.values())))
+CELLS: tuple[Cell, ...] = tuple(
+    (size, contrast, across, light)
+    for size, contrast, across, light in itertools.product(
+        *(range(len(edges) + 1) for edges in CELL_EDGES.values())
+    )
+)
 """All cells."""
 
 

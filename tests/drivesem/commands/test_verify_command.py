@@ -373,6 +373,7 @@ def test_each_figure_of_the_run(run: Path, edit: Callable[[Any], None], field: s
             "result.json: failures",
         ),
         (nested("grade_notes", value=["no peer"]), "result.json: grade_notes"),
+        (nested("visits", value=[]), "result.json: visits"),
     ],
 )
 def test_each_figure_of_a_frame(run: Path, edit: Callable[[Any], None], field: str) -> None:
