@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,6 +18,7 @@ from detectors.base import (
     Predictor,
     explain_missing_gradient,
     predict,
+    run_in_halves,
 )
 from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.incremental.regions import Rect
@@ -37,7 +38,7 @@ from drivesem.failures.fidelity import find_untrusted
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.io import round_to_8bit
-from scene_ir.render.compositor import Compositor
+from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Render, SceneIR
 
@@ -221,6 +222,30 @@ class Objective:
             self._scores[key] = self.score_image(rendered.loss, rendered.moved, rendered.detections)
         return self._scores[key]
 
+    @torch.no_grad()
+    def score_ahead(self, thetas: Sequence[Tensor]) -> None:
+        """Score several thetas (D,) and cache the scores. On a GPU their scenes are rendered and detected together; on
+        a CPU, where a picture of several costs as much as alone, they are left for `score`.
+        """
+        new = [theta for theta in thetas if _key(theta) not in self._scores]
+        if len(new) < 2 or not self.space.scene.photograph.is_cuda or not isinstance(self.detector, Detector):
+            return
+        evaluations = run_in_halves(self._evaluate_together, new, "scenes")
+        self.passes += len(new)
+        for theta, evaluated in zip(new, evaluations, strict=True):
+            self._scores[_key(theta)] = self.score_image(evaluated.loss, evaluated.moved, evaluated.detections)
+
+    def _evaluate_together(self, thetas: Sequence[Tensor]) -> list[RenderEvaluation]:
+        """Evaluate thetas (D,) in one batch. Their pictures are not cached: they would fill the memory."""
+        scenes = [self.space.apply(self.space.scene, theta) for theta in thetas]
+        renders = render_batch([(self.compositor, scene) for scene in scenes])
+        renders = [replace(render, image=round_to_8bit(render.image)) for render in renders]
+        raw = self.differentiable(torch.stack([render.image for render in renders]))
+        return [
+            self._evaluate_predictions(scene, render, raw.select(i))
+            for i, (scene, render) in enumerate(zip(scenes, renders, strict=True))
+        ]
+
     def preview(self, theta: Tensor) -> Score | None:
         """The score seen by the gradient pass at theta (D,), None without one: of an image that is not rounded to
         8 bits, in the precision of gradients.
@@ -272,6 +297,7 @@ class Objective:
             upper=self.space.upper,
             groups=tuple(self._group(parameter, where) for parameter, where in self.space.blocks.items()),
             preview=self.preview,
+            score_ahead=self.score_ahead,
             keep_last=keep_last,
             margin_oracle=margin_oracle,
         )
@@ -348,10 +374,17 @@ class Objective:
         """Detect and label a rendered state of the scene."""
         # Evaluate what is written: a file holds 8 bits, and so does a camera's picture.
         render = replace(render, image=round_to_8bit(render.image))
+        raw = self.predict(render) if isinstance(self.detector, Detector) else None
+        return self._evaluate_predictions(scene, render, raw)
+
+    def _evaluate_predictions(
+        self, scene: SceneIR, render: Render, raw: AnchorPredictions | None
+    ) -> RenderEvaluation:
+        """Label a state of the scene and decode its predictions; those of a detector without a gradient, for None."""
         paper, moved = self.labeller.paper(), self.labeller.moved(scene, render)
         labels = (moved if self.label_mode == "moved" else paper).targets
-        if isinstance(self.detector, Detector):
-            raw = self.predict(render)
+        if raw is not None:
+            assert isinstance(self.detector, Detector)
             _, loss = self.compute_loss(self.detector, raw, labels)
             detections = self.classes.map_detections(_decode(self.detector, raw))
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, final
 
@@ -56,6 +56,10 @@ def check_rate(rate: float, name: str = "rate") -> None:
     """Raise RangeError for a rate that is not positive."""
     if not (math.isfinite(rate) and rate > 0):
         raise RangeError(name, "a positive number", rate)
+
+
+def _score_later(thetas: Sequence[Tensor]) -> None:
+    return None
 
 
 def _no_preview(theta: Tensor) -> Score | None:
@@ -140,6 +144,8 @@ class Problem:
     """theta (D,) after a move (D,) from a theta; gradients are those of the loss in the move, at 0."""
     preview: Callable[[Tensor], Score | None] = _no_preview
     """Free estimate of `score` from the gradient pass at theta; None without such a pass."""
+    score_ahead: Callable[[Sequence[Tensor]], None] = _score_later
+    """Called with feasible thetas that `score` gets next; scores them together where that is faster."""
     keep_last: bool = False
     """Return the last iterate instead of the best one."""
     margin_oracle: MarginOracle | None = None
@@ -283,6 +289,7 @@ class Attack(ABC):
             if not any(torch.equal(feasible.theta, other.theta) for other in projected):
                 projected.append(feasible)
         projected = self._select_promising(problem, projected)
+        problem.score_ahead([p.theta for p in projected])
         scores = [problem.score(p.theta) for p in projected]
         ranks = [self._full_rank(problem, p.theta, score) for p, score in zip(projected, scores, strict=True)]
         best = max(range(len(ranks)), key=lambda i: (*ranks[i], -i))
