@@ -34,7 +34,9 @@ from drivesem.attacks.targets import EvaluatedClasses, TargetSelection, resolve_
 from drivesem.attacks.visibility import VisibilityUnderWeather
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import failures
+from drivesem.failures.feature_cells import CellVisit
 from drivesem.failures.fidelity import find_untrusted
+from drivesem.failures.search_log import ObjectPatches, SearchLog
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.io import round_to_8bit
@@ -123,6 +125,13 @@ class Objective:
         """Rows of the vehicles that are targeted and not ignored, and of those that are detected at theta = 0."""
         self.whole = config.whole
         self.passes = 1
+        self.search_log = SearchLog()
+        """What was evaluated so far, the benign picture first."""
+        rows = torch.tensor(self.judged, dtype=torch.int64)
+        missed = ~torch.isin(rows, torch.tensor(self.found_before, dtype=torch.int64))
+        self.search_log.record(
+            self.benign.render.image, rows, self.benign.paper.boxes_xyxy[rows], missed, self.passes
+        )
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
         self._scores: dict[bytes, Score] = {}
         self.previews: dict[bytes, Score] = {}
@@ -170,7 +179,7 @@ class Objective:
         loss, value = self.compute_loss(detector, raw, labels.targets)
         with torch.no_grad():
             detections = self.classes.map_detections(_decode(detector, raw))
-        self.previews[_key(theta)] = self.score_image(value, moved, detections)
+        self.previews[_key(theta)] = self.score_image(value, moved, detections, render.image, GRADIENT_PASSES)
         return loss, value
 
     @torch.no_grad()
@@ -218,9 +227,11 @@ class Objective:
         """
         key = _key(theta)
         if key not in self._scores:
-            rendered = self.evaluate(theta)
-            self._scores[key] = self.score_image(rendered.loss, rendered.moved, rendered.detections)
+            self._scores[key] = self._score_evaluation(self.evaluate(theta))
         return self._scores[key]
+
+    def _score_evaluation(self, evaluated: RenderEvaluation) -> Score:
+        return self.score_image(evaluated.loss, evaluated.moved, evaluated.detections, evaluated.render.image)
 
     @torch.no_grad()
     def score_ahead(self, thetas: Sequence[Tensor]) -> None:
@@ -233,7 +244,7 @@ class Objective:
         evaluations = run_in_halves(self._evaluate_together, new, "scenes")
         self.passes += len(new)
         for theta, evaluated in zip(new, evaluations, strict=True):
-            self._scores[_key(theta)] = self.score_image(evaluated.loss, evaluated.moved, evaluated.detections)
+            self._scores[_key(theta)] = self._score_evaluation(evaluated)
 
     def _evaluate_together(self, thetas: Sequence[Tensor]) -> list[RenderEvaluation]:
         """Evaluate thetas (D,) in one batch. Their pictures are not cached: they would fill the memory."""
@@ -252,8 +263,23 @@ class Objective:
         """
         return self.previews.get(_key(theta))
 
-    def score_image(self, loss: float, moved: SceneLabels, detections: Detections) -> Score:
+    def score_image(
+        self, loss: float, moved: SceneLabels, detections: Detections, image: Tensor, passes: int = 1
+    ) -> Score:
+        """The score of a state, which enters the search log.
+
+        Args:
+            loss: the objective.
+            moved: the state's labels.
+            detections: what the detector finds in it.
+            image: (3, H, W), its picture.
+            passes: detector passes that it took.
+        """
         failed = self._failures(moved, detections)
+        rows = torch.tensor(self.found_before, dtype=torch.int64)
+        rows = rows[~moved.ignore[rows]]
+        missed = torch.isin(rows, torch.tensor(failed.lost, dtype=torch.int64))
+        self.search_log.record(image.detach(), rows, moved.boxes_xyxy[rows], missed, passes)
         # The projection treats vehicles as boxes, which may hide others from the start; a render is exact.
         hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
         return Score(
@@ -264,6 +290,11 @@ class Objective:
             success_paper=self._failures(self.labeller.paper(), detections).success and not hidden,
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
+
+    def cell_visits(self, counterexample: RenderEvaluation) -> tuple[CellVisit, ...]:
+        """Visits of the benign picture and of the search, which ended at a counterexample."""
+        patches = ObjectPatches.from_image(counterexample.render.image, counterexample.moved.boxes_xyxy)
+        return self.search_log.visits(patches.cells())
 
     def feasible_set(self, limits: FeasibilityLimits | None = None, only_bounds: bool = False) -> FeasibleSet:
         """The feasible set of the scene. Weather keeps objects visible as far as `difficulty` requires, and vehicles

@@ -392,6 +392,7 @@ class AttackWorker:
             failures=failures,
             grade_notes=notes,
             passes=passes,
+            visits=objective.cell_visits(evaluation),
             seconds=end - start,
             grading_seconds=end - search_end,
         )
@@ -437,6 +438,7 @@ def _choose_change(
     all_passes = best_passes = unchanged.margin_oracle.passes
     for proposal in proposals:
         space, oracle = proposal.objective.space, proposal.margin_oracle
+        proposal.objective.search_log = unchanged.objective.search_log
         same_theta = space.convert_theta(unchanged.objective.space, result.theta)
         proposal_theta = proposal.problem.project(same_theta).theta
         margin = proposal.held_out_margin(proposal_theta)
