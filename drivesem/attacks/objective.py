@@ -384,6 +384,16 @@ class Objective:
             raise RangeError("detector", "one with a gradient", found)
         return self.detector
 
+    def detect_photograph(self) -> Detections:
+        """Detections in the photograph: those of the benign picture, which is the photograph to the bit unless vehicles
+        were exchanged, added or removed.
+        """
+        photograph = self.space.scene.photograph
+        if torch.equal(self.benign.render.image, photograph):
+            return self.benign.detections
+        self.passes += 1
+        return self.detect(photograph)
+
     @torch.no_grad()
     def detect(self, image: Tensor) -> Detections:
         """Detections of the evaluated classes in an image (3, H, W)."""

@@ -365,8 +365,8 @@ class AttackWorker:
             instance.margin_oracle.clear_cache()
             objective = instance.objective
             evaluation = objective.evaluate(result.theta)
-            benign = objective.detect(scene.photograph)
-            passes = objective.passes + 1 + other_passes
+            benign = objective.detect_photograph()
+            passes = objective.passes + other_passes
             search_end = time.perf_counter()
             release_freed_memory()
             failures, notes = grade_failures(
