@@ -19,8 +19,8 @@ GRADIENT_PASSES = 3
 MAX_RESCORED = 5
 """Maximum number of iterates with a preview that are rendered and scored: the most promising ones."""
 _PREVIEW_ERROR = 0.05
-"""Share by which a score's loss may exceed its preview's, which is of a picture not rounded to 8 bits: of 60 iterates
-on 12 generated streets, none did by more than 0.035."""
+"""Share by which a score's loss may exceed its preview's, which is of a picture not rounded to 8 bits: of 165 iterates
+of generated streets and photographs, two did by more, 0.051 and 0.052."""
 _TINY = 1e-30
 """Keeps a division defined where its result is not used."""
 
