@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,6 +18,7 @@ from detectors.base import (
     Predictor,
     explain_missing_gradient,
     predict,
+    run_in_halves,
 )
 from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.incremental.regions import Rect
@@ -39,7 +40,7 @@ from drivesem.failures.search_log import ObjectPatches, SearchLog
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.io import round_to_8bit
-from scene_ir.render.compositor import Compositor
+from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Render, SceneIR
 
@@ -226,12 +227,38 @@ class Objective:
         """
         key = _key(theta)
         if key not in self._scores:
-            rendered = self.evaluate(theta)
-            passes = 0 if rendered is self.benign else 1
-            self._scores[key] = self.score_image(
-                rendered.loss, rendered.moved, rendered.detections, rendered.render.image, passes
-            )
+            self._scores[key] = self._score_evaluation(self.evaluate(theta))
         return self._scores[key]
+
+    def _score_evaluation(self, evaluated: RenderEvaluation) -> Score:
+        passes = 0 if evaluated is self.benign else 1
+        return self.score_image(
+            evaluated.loss, evaluated.moved, evaluated.detections, evaluated.render.image, passes
+        )
+
+    @torch.no_grad()
+    def score_ahead(self, thetas: Sequence[Tensor]) -> None:
+        """Score several thetas (D,) and cache the scores. On a GPU their scenes are rendered and detected together; on
+        a CPU, where a picture of several costs as much as alone, they are left for `score`.
+        """
+        new = [theta for theta in thetas if _key(theta) not in self._scores]
+        if len(new) < 2 or not self.space.scene.photograph.is_cuda or not isinstance(self.detector, Detector):
+            return
+        evaluations = run_in_halves(self._evaluate_together, new, "scenes")
+        self.passes += len(new)
+        for theta, evaluated in zip(new, evaluations, strict=True):
+            self._scores[_key(theta)] = self._score_evaluation(evaluated)
+
+    def _evaluate_together(self, thetas: Sequence[Tensor]) -> list[RenderEvaluation]:
+        """Evaluate thetas (D,) in one batch. Their pictures are not cached: they would fill the memory."""
+        scenes = [self.space.apply(self.space.scene, theta) for theta in thetas]
+        renders = render_batch([(self.compositor, scene) for scene in scenes])
+        renders = [replace(render, image=round_to_8bit(render.image)) for render in renders]
+        raw = self.differentiable(torch.stack([render.image for render in renders]))
+        return [
+            self._evaluate_predictions(scene, render, raw.select(i))
+            for i, (scene, render) in enumerate(zip(scenes, renders, strict=True))
+        ]
 
     def preview(self, theta: Tensor) -> Score | None:
         """The score seen by the gradient pass at theta (D,), None without one: of an image that is not rounded to
@@ -304,6 +331,7 @@ class Objective:
             upper=self.space.upper,
             groups=tuple(self._group(parameter, where) for parameter, where in self.space.blocks.items()),
             preview=self.preview,
+            score_ahead=self.score_ahead,
             keep_last=keep_last,
             margin_oracle=margin_oracle,
         )
@@ -359,6 +387,16 @@ class Objective:
             raise RangeError("detector", "one with a gradient", found)
         return self.detector
 
+    def detect_photograph(self) -> Detections:
+        """Detections in the photograph: those of the benign picture, which is the photograph to the bit unless vehicles
+        were exchanged, added or removed.
+        """
+        photograph = self.space.scene.photograph
+        if torch.equal(self.benign.render.image, photograph):
+            return self.benign.detections
+        self.passes += 1
+        return self.detect(photograph)
+
     @torch.no_grad()
     def detect(self, image: Tensor) -> Detections:
         """Detections of the evaluated classes in an image (3, H, W)."""
@@ -380,10 +418,17 @@ class Objective:
         """Detect and label a rendered state of the scene."""
         # Evaluate what is written: a file holds 8 bits, and so does a camera's picture.
         render = replace(render, image=round_to_8bit(render.image))
+        raw = self.predict(render) if isinstance(self.detector, Detector) else None
+        return self._evaluate_predictions(scene, render, raw)
+
+    def _evaluate_predictions(
+        self, scene: SceneIR, render: Render, raw: AnchorPredictions | None
+    ) -> RenderEvaluation:
+        """Label a state of the scene and decode its predictions; those of a detector without a gradient, for None."""
         paper, moved = self.labeller.paper(), self.labeller.moved(scene, render)
         labels = (moved if self.label_mode == "moved" else paper).targets
-        if isinstance(self.detector, Detector):
-            raw = self.predict(render)
+        if raw is not None:
+            assert isinstance(self.detector, Detector)
             _, loss = self.compute_loss(self.detector, raw, labels)
             detections = self.classes.map_detections(_decode(self.detector, raw))
         else:
