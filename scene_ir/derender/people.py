@@ -1,0 +1,166 @@
+"""Cut people and cyclists out of a photograph by their labels, or leave them in the background with a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scene_ir.derender import cutout, upright
+from scene_ir.derender.cutout import Cutout
+from scene_ir.derender.silhouette import Placement, mask_bounds
+from scene_ir.geometry import to_clip
+from scene_ir.raster import verbs
+from scene_ir.types import Category, Frame, Labels
+
+Mask = NDArray[np.bool_]
+
+PEOPLE_CATEGORIES = {"Pedestrian": Category.PEDESTRIAN, "Cyclist": Category.CYCLIST}
+"""Label types that may become upright objects."""
+WEIGHTS = Path(__file__).parent / "weights" / "people.safetensors"
+"""The shipped weights, made by `tools/train_cutout.py --people`."""
+
+_MIN_HEIGHT_PX = 25.0
+"""Lower people are not evaluated."""
+_BORDER_PX = 2.0
+"""A box nearer to the image's border is cut by it."""
+_UNKNOWN_OCCLUSION = 3
+_MAX_COVERED = 0.1
+"""Share of a box that boxes of nearer labels may cover."""
+_MIN_REACHED = 0.85
+"""Least overlap (IoU) of the mask's box and the label's."""
+_FILLED = (0.2, 0.85)
+"""Share of its box that a mask may fill."""
+_MIN_CERTAIN = 0.75
+"""Least share of a mask's pixels that the network is certain of."""
+_CERTAIN = 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class PersonCutout:
+    """One person or cyclist cut out of the photograph."""
+
+    row: int
+    """Row of its label."""
+    placement: Placement
+    mask: Mask
+    """(H, W), its pixels."""
+    cutout: Cutout
+    """Shares of pixels."""
+
+
+def cut_out_people(
+    picture: NDArray[np.uint8], frame: Frame, rows: Sequence[int], ground: torch.Tensor, backend: verbs.Backend
+) -> tuple[list[PersonCutout], dict[int, str]]:
+    """Cut out labelled people.
+
+    Args:
+        picture: The photograph (H, W, 3) RGB.
+        frame: Its labels and, if there are any, masks.
+        rows: Rows of the labels with a 3D box.
+        ground: Plane (4,) n.x + d = 0.
+        backend: Of the rasteriser.
+
+    Returns:
+        The people that are wholly visible and have a clean outline, nearest first, with disjoint masks; and for each
+        other row of a person the reason why it stays in the background.
+    """
+    labels, camera = frame.labels, frame.camera
+    assert labels is not None
+    posed = set(rows)
+    reasons: dict[int, str] = {}
+    for row, kind in enumerate(labels.kind):
+        if kind in PEOPLE_CATEGORIES or kind == "Person_sitting":
+            reason = _find_obstacle(labels, row, frame) if row in posed else "no 3D box"
+            reasons[row] = reason
+    chosen = [row for row, reason in reasons.items() if not reason]
+    depths = to_clip(labels.translation, camera.matrix.to(labels.translation))[:, 2].tolist()
+    chosen.sort(key=lambda row: depths[row])
+    cuts: list[PersonCutout] = []
+    taken = np.zeros(picture.shape[:2], bool)
+    for row in chosen:
+        shares = _segment(picture, frame, row, taken, ground, backend)
+        shares = _inside_box(cutout.clean_cutout(shares), labels, row)
+        mask = (shares.full_map("visible", taken.shape) >= 0.5) & ~taken
+        reasons[row] = _find_flaw(mask, shares, labels.boxes_xyxy[row].tolist())
+        if reasons[row]:
+            continue
+        pose = labels.translation[row], labels.yaw[row], labels.size_lhw[row]
+        placement = upright.make_placement(mask, labels.kind[row], pose, camera)
+        cuts.append(PersonCutout(row, placement, mask, shares))
+        taken = taken | mask
+    return cuts, {row: reason for row, reason in reasons.items() if reason}
+
+
+def _segment(
+    picture: NDArray[np.uint8],
+    frame: Frame,
+    row: int,
+    taken: Mask,
+    ground: torch.Tensor,
+    backend: verbs.Backend,
+) -> Cutout:
+    """The cut-out of a label by the data set's mask if there is one, else by the network in its 2D box."""
+    labels = frame.labels
+    assert labels is not None
+    network = cutout.load_network(WEIGHTS)
+    if frame.masks is not None:
+        mask = (frame.masks[row] > 0.5).numpy() & ~taken
+        empty = Cutout(0, 0, *(np.zeros((0, 0), np.float32),) * 3)
+        return cutout.cutout_from_mask(picture, mask, taken, network) if mask.any() else empty
+    guide = upright.place_box(labels.boxes_xyxy[row], labels.translation[row], frame.camera)
+    return cutout.cut_out(picture, [guide], [taken], ground, frame.camera, backend, network=network)[0]
+
+
+def _find_obstacle(labels: Labels, row: int, frame: Frame) -> str:
+    """Why a label cannot be cut out whole, by the labels alone; empty if nothing is against it."""
+    x0, y0, x1, y1 = box = labels.boxes_xyxy[row].tolist()
+    if labels.kind[row] == "Person_sitting":
+        return "sitting"
+    if y1 - y0 < _MIN_HEIGHT_PX:
+        return f"lower than {_MIN_HEIGHT_PX:.0f} px"
+    right, bottom = frame.camera.width - 1 - _BORDER_PX, frame.camera.height - 1 - _BORDER_PX
+    if min(x0, y0) < _BORDER_PX or x1 > right or y1 > bottom or float(labels.truncation[row]) > 0:
+        return "cut by the border"
+    if 0 < int(labels.occlusion[row]) < _UNKNOWN_OCCLUSION:
+        return "partly hidden"
+    others = [other for i, other in enumerate(labels.boxes_xyxy.tolist()) if i != row]
+    covered = [_shared_area(box, other) for other in others if other[3] > y1 - 0.05 * (y1 - y0)]
+    people = [_shared_area(box, region) for region in labels.ignore_xyxy.tolist()]
+    if max([*covered, *people], default=0.0) > _MAX_COVERED * (x1 - x0) * (y1 - y0):
+        return "overlaps others"
+    return ""
+
+
+def _find_flaw(mask: Mask, shares: Cutout, box_xyxy: list[float]) -> str:
+    """Why a mask is not a clean outline of the object in a box; empty if it is."""
+    if not mask.any():
+        return "no outline"
+    found = [float(side) for side in mask_bounds(mask)]
+    x0, y0, x1, y1 = box_xyxy
+    area, shared = (x1 - x0) * (y1 - y0), _shared_area(found, box_xyxy)
+    own = (found[2] - found[0]) * (found[3] - found[1])
+    certain = np.count_nonzero(shares.visible >= _CERTAIN) / np.count_nonzero(shares.visible >= 0.5)
+    filled = _FILLED[0] * area <= np.count_nonzero(mask) <= _FILLED[1] * area
+    if shared < _MIN_REACHED * (area + own - shared) or not filled or certain < _MIN_CERTAIN:
+        return "no clean outline"
+    return ""
+
+
+def _inside_box(shares: Cutout, labels: Labels, row: int) -> Cutout:
+    """A cut-out limited to its label's 2D box with a small margin, and without occluders: it is wholly visible."""
+    x0, y0, x1, y1 = labels.boxes_xyxy[row].tolist()
+    margin = 2.0 + 0.02 * (y1 - y0)
+    rows, columns = shares.window
+    down, across = np.arange(rows.start, rows.stop)[:, None], np.arange(columns.start, columns.stop)
+    inside = (down >= y0 - margin) & (down <= y1 + margin) & (across >= x0 - margin) & (across <= x1 + margin)
+    return replace(shares, visible=shares.visible * inside, front=np.zeros_like(shares.front))
+
+
+def _shared_area(a: Sequence[float], b: Sequence[float]) -> float:
+    """Area px2 shared by two boxes xyxy."""
+    return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
