@@ -17,12 +17,25 @@ from scene_ir.types import Camera, Mesh, Part
 
 Mask = NDArray[np.bool_]
 
+
+@dataclass(frozen=True, slots=True)
+class OutlineDetail:
+    """How closely a surface follows its mask."""
+
+    cells: int
+    """Cells over the height."""
+    cell_px: tuple[float, float]
+    """Bounds of their sides, px."""
+    margin_px: float
+    """How far the surface reaches beyond the mask, px."""
+
+
+UNDER_MATTE = OutlineDetail(24, (2.0, 12.0), 1.5)
+"""For surfaces with an outline drawn by the matte."""
+ALONG_MASK = OutlineDetail(60, (1.5, 6.0), 0.0)
+"""For surfaces with an outline of their own."""
 _GUIDE_DEPTH_M = 0.3
 """Thickness of the box that shows the network where a person is."""
-_CELLS, _CELL_PX = 24, (2.0, 12.0)
-"""Cells over an object's height, and bounds of their sides, px."""
-_MARGIN_PX = 1.5
-"""How far the surface reaches beyond the mask, px."""
 _DRAWN = 0.7
 """How far corners outside are drawn to the border: wholly, cells at tips would lose their area."""
 _SLOPE, _RELIEF_M = 0.6, 0.12
@@ -69,7 +82,13 @@ def _unit_box() -> Mesh:
     return Mesh(corners, faces, torch.full((len(faces),), int(Part.OTHER)), "box")
 
 
-def make_placement(mask: Mask, kind: str, pose: tuple[Tensor, Tensor, Tensor], camera: Camera) -> Placement:
+def make_placement(
+    mask: Mask,
+    kind: str,
+    pose: tuple[Tensor, Tensor, Tensor],
+    camera: Camera,
+    detail: OutlineDetail = UNDER_MATTE,
+) -> Placement:
     """The surface of one person or cyclist: upright, facing the camera through the labelled place, with the outline of
     a mask and a shallow relief.
 
@@ -78,13 +97,14 @@ def make_placement(mask: Mask, kind: str, pose: tuple[Tensor, Tensor, Tensor], c
         kind: Type as labelled, which decides what of it is clothing.
         pose: Labelled translation (3,) m, yaw () rad and size (3,) m; the object's frame.
         camera: The photograph's camera.
+        detail: How closely the surface follows the mask.
 
     Returns:
         The placed surface; its mesh is closed, and may reach beyond the unit box where the mask reaches beyond the
         label.
     """
     translation, yaw, size_lhw = (part.double() for part in pose)
-    grid = _OutlineGrid.from_mask(mask)
+    grid = _OutlineGrid.from_mask(mask, detail)
     matrix = camera.matrix.double()
     inverse = torch.linalg.inv(matrix[:, :3])
     centre = -inverse @ matrix[:, 3]
@@ -120,12 +140,12 @@ class _OutlineGrid:
     """(Q, 4), corners of each cell: upper left, upper right, lower right, lower left."""
 
     @classmethod
-    def from_mask(cls, mask: Mask) -> _OutlineGrid:
+    def from_mask(cls, mask: Mask, detail: OutlineDetail) -> _OutlineGrid:
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        pad = int(2 * _MARGIN_PX) + 2
+        pad = int(2 * detail.margin_px) + 2
         inner = np.pad(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], pad)
-        wide = cv2.distanceTransform((~inner).astype(np.uint8), cv2.DIST_L2, 5) <= _MARGIN_PX
-        side = float(np.clip((rows[-1] + 1 - rows[0]) / _CELLS, *_CELL_PX))
+        wide = cv2.distanceTransform((~inner).astype(np.uint8), cv2.DIST_L2, 5) <= detail.margin_px
+        side = float(np.clip((rows[-1] + 1 - rows[0]) / detail.cells, *detail.cell_px))
         count = [int(np.ceil(n / side)) for n in wide.shape]
         y, x = np.nonzero(wide)
         used = np.zeros(count, bool)
