@@ -565,7 +565,7 @@ def _road_violations(base: SceneIR, road: Array, old: _MeasuredCar, new: _Measur
 
 
 def _level_ground(base: SceneIR) -> Array:
-    """Pixels (H, W), 0 or 1, whose background is as far away as the ground plane."""
+    """Pixels (H, W), 0 or 1, with a background as far away as the ground plane."""
     matrix, plane = base.camera.matrix.double().numpy(), base.environment.ground.double().numpy()
     inverse = np.linalg.inv(matrix[:, :3])
     y, x = np.mgrid[0 : base.camera.height, 0 : base.camera.width]

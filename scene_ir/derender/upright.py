@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from scene_ir.derender.silhouette import Placement, place_mesh
 from scene_ir.geometry import to_clip, yaw_matrix
-from scene_ir.types import Camera, Mesh, Part
+from scene_ir.types import Camera, Mesh, Part, SceneIR
 
 Mask = NDArray[np.bool_]
 
@@ -36,6 +36,8 @@ ALONG_MASK = OutlineDetail(60, (1.5, 6.0), 0.0)
 """For surfaces with an outline of their own."""
 _GUIDE_DEPTH_M = 0.3
 """Thickness of the box that shows the network where a person is."""
+_SOLID = 0.5
+"""Opacity from which a pixel is the object."""
 _DRAWN = 0.7
 """How far corners outside are drawn to the border: wholly, cells at tips would lose their area."""
 _SLOPE, _RELIEF_M = 0.6, 0.12
@@ -126,6 +128,20 @@ def make_placement(
     low, high = _CLOTHED[kind]
     part = torch.where((share > low) & (share < high), int(Part.PAINT), int(Part.OTHER))
     return place_mesh(Mesh(unit.float(), faces, part, kind.lower()), *pose)
+
+
+def trim_to_mattes(scene: SceneIR) -> SceneIR:
+    """A scene in which the outlines of upright surfaces are those of their mattes, for renderers without mattes."""
+    meshes, camera = list(scene.meshes), scene.camera
+    for row in scene.objects.upright.nonzero()[:, 0].tolist() if scene.objects.source else ():
+        source, index = scene.objects.source[row], int(scene.objects.mesh_index[row])
+        crop, solid = source.foreground, np.zeros((camera.height, camera.width), bool)
+        h, w = crop.values.shape[1:]
+        solid[crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w] = crop.values[3].cpu().numpy() >= _SOLID
+        if solid.any():
+            pose, kind = (source.translation, source.yaw, source.size_lhw), meshes[index].name.capitalize()
+            meshes[index] = make_placement(solid, kind, pose, camera, ALONG_MASK).mesh
+    return replace(scene, meshes=tuple(meshes))
 
 
 @dataclass(frozen=True, slots=True)

@@ -269,16 +269,16 @@ _FOOTPRINT = cell_centres(*_FOOTPRINT_GRID)
 
 
 class RoadMap:
-    """The road of a scene, sampled under footprints. People and cyclists that stand beside it have the level ground
+    """The road of a scene, sampled under footprints. People and cyclists off the road have the level ground
     there in its place.
     """
 
     def __init__(self, scene: SceneIR) -> None:
         road, upright = to_float64_array(scene.environment.road), scene.objects.upright.cpu().numpy()
-        beside = upright & (_sample_feet(road, scene) < _ON_ROAD) if upright.any() else upright
-        maps = [road, _level_ground(scene) * (1 - road)] if beside.any() else [road]
+        off_road = upright & (_sample_feet(road, scene) < _ON_ROAD) if upright.any() else upright
+        maps = [road, _level_ground(scene) * (1 - road)] if off_road.any() else [road]
         self._road = np.concatenate([one.reshape(-1) for one in maps])
-        self._start = np.where(beside, road.size, 0)
+        self._start = np.where(off_road, road.size, 0)
         self._width = scene.camera.width
         self._limit = np.array([scene.camera.width - 1.0, scene.camera.height - 1.0])
 

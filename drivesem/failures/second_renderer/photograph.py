@@ -34,7 +34,7 @@ from drivesem.failures.second_renderer.opengl import (
 )
 from drivesem.failures.second_renderer.shading import GroundShadow
 from scene_ir.errors import RangeError
-from scene_ir.types import Crop, Mesh, Occluder, Render, SceneIR, Source
+from scene_ir.types import Crop, Occluder, Render, SceneIR, Source
 
 _MIN_SHARE = 0.5
 """Minimum coverage of a pixel that shows an object; minimum visible share of an object, relative to the
@@ -136,8 +136,7 @@ class PhotographRenderer:
 
     def _make_vehicle(self, source: Source, i: int) -> _Vehicle:
         objects = self._still.objects
-        mesh = self._still.meshes[int(objects.mesh_index[i])]
-        body = BodyMesh(_trim_to_matte(mesh, source, self._still) if bool(objects.upright[i]) else mesh)
+        body = BodyMesh(self._still.meshes[int(objects.mesh_index[i])])
         appearance = BakedAppearance(source, self._occluded_area(i))
         normal = to_numpy(self._still.environment.ground)[:3]
         placed, camera = body.place(VehiclePose.from_source(source), self._camera), self._camera
@@ -275,20 +274,6 @@ class PhotographRenderer:
             | (truncation > limits.max_truncation)
             | faint
         )
-
-
-def _trim_to_matte(mesh: Mesh, source: Source, scene: SceneIR) -> Mesh:
-    """The upright surface of a person with the outline of its matte: this renderer has no mattes."""
-    from scene_ir.derender import upright
-
-    crop, solid = source.foreground, np.zeros((scene.camera.height, scene.camera.width), bool)
-    alpha = to_numpy(crop.values)[3]
-    solid[crop.y0 : crop.y0 + alpha.shape[0], crop.x0 : crop.x0 + alpha.shape[1]] = alpha >= _MIN_SHARE
-    if not solid.any():
-        return mesh
-    pose = source.translation, source.yaw, source.size_lhw
-    kind = mesh.name.capitalize()
-    return upright.make_placement(solid, kind, pose, scene.camera, upright.ALONG_MASK).mesh
 
 
 def _to_image(tensor: Tensor) -> Array:
