@@ -101,7 +101,8 @@ class SecondRenderers:
         if scene.before is not None:
             return ExchangedSceneRenderer(identifier, scene)
         is_demo = scene.provenance.get("dataset") == DEMO
-        if self._folder is None and not is_demo:
+        photographed = self._folder is None and not is_demo
+        if photographed or bool(scene.objects.upright.any()):  # plans hold no surfaces of people
             return _make_photograph_renderer(identifier, scene)
         from drivesem.failures.second_renderer.generator import DemoPlans, GeneratorRenderer
 
