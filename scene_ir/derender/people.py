@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from scene_ir.derender import cutout, upright
 from scene_ir.derender.cutout import Cutout
-from scene_ir.derender.silhouette import Placement, mask_bounds
+from scene_ir.derender.silhouette import Placement, grow_mask, mask_bounds
 from scene_ir.geometry import to_clip
 from scene_ir.raster import verbs
 from scene_ir.types import Category, Frame, Labels
@@ -31,13 +32,19 @@ _BORDER_PX = 2.0
 _UNKNOWN_OCCLUSION = 3
 _MAX_COVERED = 0.1
 """Share of a box that boxes of nearer labels may cover."""
-_MIN_REACHED = 0.85
-"""Least overlap (IoU) of the mask's box and the label's."""
+_BORDER = 1.5
+"""Reach of soft pixels on either side of a mask's border, px."""
+_MIN_REST = 0.1
+"""Least share of a pixel that is no occluder."""
+_PIECE, _HOLE = 0.1, 0.01
+"""Least area of a separate piece, as a share of the largest; area up to which a hole is filled, as a share of all."""
+_SIDE = 0.1
+"""Largest distance of the mask's sides from the label's, as a share of its height; and 2 px."""
 _FILLED = (0.2, 0.85)
 """Share of its box that a mask may fill."""
-_MIN_CERTAIN = 0.75
-"""Least share of a mask's pixels that the network is certain of."""
-_CERTAIN = 0.9
+_UNSURE, _MAX_UNSURE = (0.25, 0.75), 0.35
+"""Shares between which the network is unsure of a pixel, and the most such pixels, as a share of the mask's: at small
+sizes the border alone is many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +90,12 @@ def cut_out_people(
     cuts: list[PersonCutout] = []
     taken = np.zeros(picture.shape[:2], bool)
     for row in chosen:
-        shares = _segment(picture, frame, row, taken, ground, backend)
-        shares = _inside_box(cutout.clean_cutout(shares), labels, row)
-        mask = (shares.full_map("visible", taken.shape) >= 0.5) & ~taken
+        shares = _inside_box(_segment(picture, frame, row, taken, ground, backend), labels, row)
+        mask = _remove_specks((shares.full_map("visible", taken.shape) >= 0.5) & ~taken)
         reasons[row] = _find_flaw(mask, shares, labels.boxes_xyxy[row].tolist())
         if reasons[row]:
             continue
+        shares = _firm_up(shares, mask)
         pose = labels.translation[row], labels.yaw[row], labels.size_lhw[row]
         placement = upright.make_placement(mask, labels.kind[row], pose, camera)
         cuts.append(PersonCutout(row, placement, mask, shares))
@@ -136,29 +143,49 @@ def _find_obstacle(labels: Labels, row: int, frame: Frame) -> str:
     return ""
 
 
+def _firm_up(shares: Cutout, mask: Mask) -> Cutout:
+    """A cut-out that is soft along the border of its mask alone: people are opaque."""
+    low, high = _UNSURE
+    soft = np.clip((shares.visible - low) / (high - low), 0, 1) * grow_mask(mask, _BORDER)[shares.window]
+    return replace(shares, visible=np.maximum(soft, grow_mask(mask, -_BORDER)[shares.window]).astype(np.float32))
+
+
+def _remove_specks(mask: Mask) -> Mask:
+    """A mask without separate small pieces, and without holes too small for arms and legs to enclose."""
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
+    areas[0] = 0
+    solid = (areas >= max(_PIECE * areas.max(), 1))[pieces]
+    _, holes, stats, _ = cv2.connectedComponentsWithStats((~solid).astype(np.uint8), connectivity=4)
+    small = stats[:, cv2.CC_STAT_AREA] <= _HOLE * areas.max()
+    return solid | (small[holes] & ~solid)
+
+
 def _find_flaw(mask: Mask, shares: Cutout, box_xyxy: list[float]) -> str:
     """Why a mask is not a clean outline of the object in a box; empty if it is."""
     if not mask.any():
         return "no outline"
-    found = [float(side) for side in mask_bounds(mask)]
     x0, y0, x1, y1 = box_xyxy
-    area, shared = (x1 - x0) * (y1 - y0), _shared_area(found, box_xyxy)
-    own = (found[2] - found[0]) * (found[3] - found[1])
-    certain = np.count_nonzero(shares.visible >= _CERTAIN) / np.count_nonzero(shares.visible >= 0.5)
-    filled = _FILLED[0] * area <= np.count_nonzero(mask) <= _FILLED[1] * area
-    if shared < _MIN_REACHED * (area + own - shared) or not filled or certain < _MIN_CERTAIN:
+    apart = np.abs(np.subtract(mask_bounds(mask), (x0, y0, x1 + 1, y1 + 1))).max()
+    area, count = (x1 - x0) * (y1 - y0), np.count_nonzero(mask)
+    unsure = np.count_nonzero((shares.visible > _UNSURE[0]) & (shares.visible < _UNSURE[1]))
+    filled = _FILLED[0] * area <= count <= _FILLED[1] * area
+    if apart > _SIDE * (y1 - y0) + 2 or not filled or unsure > _MAX_UNSURE * count:
         return "no clean outline"
     return ""
 
 
 def _inside_box(shares: Cutout, labels: Labels, row: int) -> Cutout:
-    """A cut-out limited to its label's 2D box with a small margin, and without occluders: it is wholly visible."""
+    """A cut-out limited to its label's 2D box with a small margin, and without occluders: the label is wholly visible,
+    so what the network takes for one is shared among object and background.
+    """
     x0, y0, x1, y1 = labels.boxes_xyxy[row].tolist()
     margin = 2.0 + 0.02 * (y1 - y0)
     rows, columns = shares.window
     down, across = np.arange(rows.start, rows.stop)[:, None], np.arange(columns.start, columns.stop)
     inside = (down >= y0 - margin) & (down <= y1 + margin) & (across >= x0 - margin) & (across <= x1 + margin)
-    return replace(shares, visible=shares.visible * inside, front=np.zeros_like(shares.front))
+    visible = inside * shares.visible / np.maximum(1 - shares.front, _MIN_REST)
+    return replace(shares, visible=visible.clip(0, 1).astype(np.float32), front=np.zeros_like(shares.front))
 
 
 def _shared_area(a: Sequence[float], b: Sequence[float]) -> float:
