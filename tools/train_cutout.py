@@ -414,7 +414,9 @@ def vary_clothes(photograph: Bytes, visible: Bytes, rng: np.random.Generator) ->
     h, w = visible.shape
     folds = np.zeros((h, w, 3), np.float32)
     for cells in (2, 5, 12):
-        coarse = rng.normal(0, rng.uniform(0, 0.4), (cells * 2, cells, 1)) + rng.normal(0, 0.1, (cells * 2, cells, 3))
+        coarse = rng.normal(0, rng.uniform(0, 0.4), (cells * 2, cells, 1)) + rng.normal(
+            0, 0.1, (cells * 2, cells, 3)
+        )
         folds += cv2.resize(coarse.astype(np.float32), (w, h), interpolation=cv2.INTER_CUBIC)
     alpha = visible.astype(np.float32)[..., None] / 255
     return np.clip(photograph * (1 + alpha * (np.exp(folds) - 1)), 0, 255).astype(np.uint8)
@@ -646,24 +648,23 @@ def judge(store: CutoutStore, network: CutoutNet, amount: float, most: int = 200
     }
 
 
-CARD = """# Vehicles cut out of photographs, trained on generated streets
+CARD = """# {title} cut out of photographs, trained on generated streets
 
 - Architecture: `scene_ir.derender.cutout.CutoutNet`, {parameters:,} parameters: an encoder to a sixteenth and back
-  on a 96x160 crop around the placed template (colours, the template's coverage and surface, nearness to its
-  footprint, nearer vehicles), and {second:,} for a refinement at the photograph's own pixels along the borders.
-- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
+  on a 96x160 crop around {guide} (colours, its coverage and surface, nearness to its
+  footprint, nearer objects), and {second:,} for a refinement at the photograph's own pixels along the borders.
+- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. {start}
+  SHA-256: `{sha256}`
 - Data: {frames:,} streets of the project's own generator (version {version}, split train, seed {data_seed}),
-  {vehicles:,} vehicles at least {least:.0f} px high of which 10% show; no photographs. Every other street has
-  vehicles and skies of the pack that `tools/fetch_assets.py` fetches. Templates at labels that are off as after
-  the fit, as drawn by hand, and by twice that; some of a wrong kind. Other light and colours, blur, noise,
-  compression; vehicles painted as bright as what is around them; poles in front.
+  {vehicles:,} objects at least {least:.0f} px high of which 10% show; no photographs. {variety}
+  Other light and colours, blur, noise, compression; objects as bright as what is around them; poles in front.
 - Training: {steps:,} steps of {batch}, in {count} cycles of the rate, {minutes:.0f} minutes of one CPU core,
   seed {seed}.{note}
 
 ## Figures
 
-Held out: {held} vehicles of the generator's split heldout (shapes and streets that no training street has), seed
-{held_seed}. Labels are off by `amount` times 0.2 m, 5 degrees and 5%. "large": at least 40 px high, of which 70%
+Held out: {held} objects of the generator's split heldout (shapes and streets that no training street has), seed
+{held_seed}. Labels are off by `amount` times {off}. "large": at least 40 px high, of which 70%
 show; "others": smaller or more hidden. IoU of the pixels at least half covered; border: mean error of the shares
 across the true border, in px.
 
@@ -671,18 +672,41 @@ across the true border, in px.
 
 ## Limits
 
-It has seen generated pictures only. Without a template near its place it finds nothing: it is no detector. On
-photographs it takes dark parts of vehicles for occluders now and then, and misses thin poles and trunks;
-`believed` keeps of the former only what is shaped like a pole or known from elsewhere. Not for use in a vehicle.
+It has seen generated pictures only. Without {guide} it finds nothing: it is no detector.
+{limits} Not for use in a vehicle.
 
 ## Train it again
 
 ```
 python tools/fetch_assets.py build/assets
-python tools/train_cutout.py --assets build/assets --frames {frames} --steps {cycles} --seed {seed}
+python tools/train_cutout.py {option} --frames {frames} --steps {cycles} --seed {seed}
 ```
 With the same, on the same machine, another run gives the same bytes.
 """
+VEHICLE_CARD = {
+    "title": "Vehicles",
+    "guide": "the placed template",
+    "start": "Nothing pretrained.",
+    "variety": """Every other street has
+  vehicles and skies of the pack that `tools/fetch_assets.py` fetches. Templates at labels that are off as after
+  the fit, as drawn by hand, and by twice that; some of a wrong kind.""",
+    "off": "0.2 m, 5 degrees and 5%",
+    "limits": """On
+photographs it takes dark parts of vehicles for occluders now and then, and misses thin poles and trunks;
+`remove_unlikely_occluders` keeps of the former only what is shaped like a pole or known from elsewhere.""",
+    "option": "--assets build/assets",
+}
+PEOPLE_CARD = {
+    "title": "People and cyclists",
+    "guide": "a thin upright box that fills the label's 2D box",
+    "start": "Trained on from `cutout.safetensors`.",
+    "variety": """Boxes
+  with sides that are off as drawn by hand, more, and less. Clothes with folds and patterns.""",
+    "off": "4% of the box's sides",
+    "limits": """On photographs it is unsure of very bright clothes, bags, and people under 40 px high, and it leaves
+out what people carry and push; `scene_ir.derender.people` uses no outline that it is unsure of.""",
+    "option": "--people --out scene_ir/derender/weights/people.safetensors",
+}
 COLUMNS = (
     *(("vehicles", "large", "{:.0f}"), ("iou", "IoU", "{:.3f}"), ("iou_p10", "IoU, 10%", "{:.3f}")),
     *(("others", "others", "{:.0f}"), ("others_iou", "IoU", "{:.3f}"), ("others_iou_p10", "IoU, 10%", "{:.3f}")),
@@ -701,7 +725,9 @@ def format_table(metrics: dict[float, dict[str, float]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="pack of vehicles and skies; without it only the templates'")
-    parser.add_argument("--people", action="store_true", help="learn people and cyclists, from the vehicles' weights")
+    parser.add_argument(
+        "--people", action="store_true", help="learn people and cyclists, from the vehicles' weights"
+    )
     parser.add_argument("--run", type=Path, default=Path("build/cutout"), help="streets, checkpoint, log")
     parser.add_argument("--out", type=Path, default=cutout.WEIGHTS)
     parser.add_argument("--frames", type=int, default=240, help="streets to train on")
@@ -720,9 +746,12 @@ def main() -> None:
     cycles = tuple((steps, rates[min(i, len(rates) - 1)]) for i, steps in enumerate(arguments.steps))
     settings = CutoutSettings(cycles, arguments.batch, seed=arguments.seed)
     seeds, people = (arguments.data_seed, arguments.data_seed + 1), arguments.people
-    store = CutoutStore(make(arguments.run / "train", "train", seeds[0], arguments.frames, arguments.assets, people), people)
-    held = make(arguments.run / "heldout", "heldout", seeds[1], arguments.held_out, arguments.assets, people)
-    held = CutoutStore(held, people)
+    store, held = (
+        CutoutStore(make(arguments.run / split, split, seed, frames, arguments.assets, people), people)
+        for split, seed, frames in zip(
+            ("train", "heldout"), seeds, (arguments.frames, arguments.held_out), strict=True
+        )
+    )
     run = CutoutRun(settings)
     if people:
         run.network.load_state_dict(cutout.load_network().state_dict())
@@ -764,6 +793,8 @@ def main() -> None:
         note=f"\n  {arguments.remark}" if arguments.remark else "",
         held=len(held),
         table=format_table(metrics),
+        sha256=files.sha256_digest(arguments.out),
+        **(PEOPLE_CARD if people else VEHICLE_CARD),
     )
     files.write_text(arguments.out.with_suffix(".md"), card)
 

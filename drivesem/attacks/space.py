@@ -242,7 +242,9 @@ class Budget:
 
     def __post_init__(self) -> None:
         unbounded = ("translate_m", "across_m", "distance_share", "partly_visible")
-        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun", "night", "snow", "lamps", "walk_m"))
+        _check_positive(
+            "budget", self, unbounded, zero_allowed=("size", "sun", "night", "snow", "lamps", "walk_m")
+        )
 
     def check(self, params: Iterable[Parameter], parametrisation: Parametrisation = "ground") -> None:
         """Raise FormatError for a parameter that this budget fixes, or for a budget in metres with `roi`."""

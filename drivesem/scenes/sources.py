@@ -250,7 +250,7 @@ def _load_finder(config: SceneOptions) -> Predictor:
 
 
 def derender_settings(
-    fit: bool, meshes: str | Path | None = None, segmenter: str | Path | None = None
+    fit: bool, meshes: str | Path | None = None, segmenter: str | Path | None = None, people: bool = False
 ) -> DerenderSettings:
     """Make the settings of de-rendering.
 
@@ -258,6 +258,7 @@ def derender_settings(
         fit: Fit vehicles to their outlines.
         meshes: Folder of additional meshes.
         segmenter: ONNX file of a segmentation network.
+        people: Make objects of people and cyclists too.
 
     Returns:
         The settings.
@@ -268,7 +269,7 @@ def derender_settings(
     from scene_ir.derender.derender import DerenderSettings
     from scene_ir.derender.silhouette import UserMesh
 
-    settings = DerenderSettings() if fit else DerenderSettings.fast()
+    settings = replace(DerenderSettings() if fit else DerenderSettings.fast(), people=people)
     if segmenter is not None:
         from drivesem.scenes.segmenter import OnnxSegmenter
 
@@ -283,8 +284,9 @@ def derender_settings(
 
 
 def _make_settings(config: SceneOptions) -> DerenderSettings:
-    more = (config.meshes, config.segmenter) if isinstance(config, DerenderConfig) else ()
-    return replace(derender_settings(config.fit, *more), people=config.moves_people)
+    if isinstance(config, DerenderConfig):
+        return derender_settings(config.fit, config.meshes, config.segmenter, config.people)
+    return derender_settings(config.fit, people=config.moves_people)
 
 
 def _open_cache(config: SceneOptions) -> SceneCache | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scene_ir.derender import patch_fill, street
 from scene_ir.derender.segmentation import Segmentation
-from scene_ir.derender.silhouette import grow_mask
+from scene_ir.derender.silhouette import grow_mask, mask_bounds
 from scene_ir.derender.standing_surfaces import ColumnCopySettings, copy_columns
 from scene_ir.types import Camera
 
@@ -30,6 +30,8 @@ _VEHICLE_SHARE, _MIN_CORE_PX, _AROUND_CORE_PX = 0.97, 150, 150
 """Share and least area of the core of an unlabelled vehicle, and how far its less certain rest extends."""
 _MIN_REST = 0.05
 """A smaller share of all but vehicles carries no information."""
+_NEAR_THIN = 1.5
+"""Range around a person from which patches are copied, in heights."""
 _BORDER_PX = 5
 """Pixels this near to vehicles and shadows are not copied: their colours are mixed, and masks have errors."""
 
@@ -138,6 +140,27 @@ class BackgroundFill:
         """The image (H, W, 3) with the hole (H, W) filled; `seed` is the random search's."""
         filled = self._fill_hole(_scale_mask(hole, self._work.shrink), seed)
         return filled if self._work is self._full else self._full.enlarge(filled, hole)
+
+    def fill_thin(self, filled: Array, thin: Mask, hole: Mask, seed: int) -> Array:
+        """The image (H, W, 3) with what stood before it filled by patches of what is near, as suits objects that
+        are narrower than what they hide.
+
+        Args:
+            filled: The image, filled otherwise.
+            thin: Pixels (H, W) of one person.
+            hole: All filled pixels (H, W), not copied.
+            seed: Of the random search.
+        """
+        x0, y0, x1, y1 = mask_bounds(thin)
+        reach = round(_NEAR_THIN * (y1 - y0))
+        window = (slice(max(y0 - reach, 0), y1 + reach), slice(max(x0 - reach, 0), x1 + reach))
+        inputs = self._full.inputs
+        forbidden = _excluded_pixels(self._full, hole)[window] | (grow_mask(hole, 1) & ~thin)[window]
+        ground = patch_fill.GroundMaps(np.zeros_like(thin[window]), inputs.maps.ground[window].astype(np.float32))
+        image = filled.copy()
+        horizon = inputs.horizon - window[0].start
+        image[window] = patch_fill.fill_patches(filled[window], thin[window], forbidden, horizon, ground, seed)
+        return image
 
     def _fill_hole(self, hole: Mask, seed: int) -> Array:
         work, shrink = self._work, self._work.shrink

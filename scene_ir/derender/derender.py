@@ -66,6 +66,8 @@ _MAX_LABELS = 500
 """Labels of a frame: each vehicle takes megabytes and a second."""
 _FADE = (0.08, 0.45)
 """Opacity of a vehicle up to which the background is the photograph, and from which it is the fill."""
+_TRACE_OPACITY = 0.05
+"""Least opacity of people where they may be: what of them is in the photograph there is solved for."""
 _FADE_OCCLUDER = 0.98
 """Opacity of an occluder from which the background is the photograph."""
 _OUTLINE_TOLERANCE = 0.015
@@ -139,6 +141,8 @@ class _VehicleCutout:
     """IoU of mask and outline."""
     cutout: Cutout
     """Shares of pixels."""
+    reach: Mask | None = None
+    """(H, W), of people: pixels that leave with them."""
 
 
 def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
@@ -360,9 +364,8 @@ def _place_people(
         mask = person.mask & ~hidden
         if mask.any():
             agreement = mask_iou(mask, outline, hidden)
-            shares = person.cutout
-            cut = _VehicleCutout(person.row, person.placement, mask, hidden, outline, agreement, shares)
-            placed.append(cut)
+            parts = (mask, hidden, outline, agreement, person.cutout, person.reach & ~hidden)
+            placed.append(_VehicleCutout(person.row, person.placement, *parts))
     return placed
 
 
@@ -694,8 +697,14 @@ def _separate_layers(
     for cut, region, view in zip(cuts, shaded, views, strict=True):
         hole |= grow_mask(view.in_frame(region, hole.shape), 2.5) | grow_mask(cut.mask, 4)
         hole[view.window] |= view.distance < 0.2
+    reaches = [(i, cut.reach) for i, cut in enumerate(cuts) if cut.reach is not None]
+    for _, reach in reaches:
+        hole |= grow_mask(reach, 2)
     filled = fill.fill_hole(hole, settings.seed)
     mattes = [cutout_opacity(cut.cutout, cut.mask, cut.hidden) for cut in cuts]
+    for i, reach in reaches:
+        filled = fill.fill_thin(filled, grow_mask(reach, 2), hole, settings.seed)
+        mattes[i] = np.maximum(mattes[i], _TRACE_OPACITY * reach).astype(np.float32)
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
     for region, view in zip(shaded, views, strict=True):
@@ -705,7 +714,8 @@ def _separate_layers(
             beyond = cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 5)
             shadow_share[wide] = np.maximum(shadow_share[wide], np.clip(1.25 - beyond / 2.5, 0, 1))
     # Where a matte is thin, most of the pixel is background already: the fill fades into it.
-    replaced = np.clip(np.maximum(shadow_share, (opaque - _FADE[0]) / (_FADE[1] - _FADE[0])), 0, 1)[..., None]
+    replaced = np.clip(np.maximum(shadow_share, (opaque - _FADE[0]) / (_FADE[1] - _FADE[0])), 0, 1)
+    replaced = np.maximum(replaced, _union([reach for _, reach in reaches], replaced.shape))[..., None]
     mixed = image + (filled - image) * replaced
     # A shadow only darkens: where the fill is darker than the photograph, the photograph is the background.
     only_shadow = (opaque == 0)[..., None]

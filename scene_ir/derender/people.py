@@ -32,6 +32,9 @@ _BORDER_PX = 2.0
 _UNKNOWN_OCCLUSION = 3
 _MAX_COVERED = 0.1
 """Share of a box that boxes of nearer labels may cover."""
+_SOLID, _TRACE = 0.4, 0.15
+"""Share from which a pixel is the object, and from which it may hold some of it: of bright clothes and bags the
+network is less sure than of the rest."""
 _BORDER = 1.5
 """Reach of soft pixels on either side of a mask's border, px."""
 _MIN_REST = 0.1
@@ -42,9 +45,11 @@ _SIDE = 0.1
 """Largest distance of the mask's sides from the label's, as a share of its height; and 2 px."""
 _FILLED = (0.2, 0.85)
 """Share of its box that a mask may fill."""
-_UNSURE, _MAX_UNSURE = (0.25, 0.75), 0.35
-"""Shares between which the network is unsure of a pixel, and the most such pixels, as a share of the mask's: at small
-sizes the border alone is many."""
+_UNSURE = (0.25, 0.75)
+"""Shares between which the network is unsure of a pixel."""
+_MAX_UNSURE, _MAX_UNSURE_INSIDE = 0.7, 0.22
+"""Most pixels that it is unsure of, as a share of the mask's: in all, of which small masks have many along their
+border, and more than 2 px away from it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,8 @@ class PersonCutout:
     placement: Placement
     mask: Mask
     """(H, W), its pixels."""
+    reach: Mask
+    """(H, W), its pixels and those around that may hold some of it: they leave with it."""
     cutout: Cutout
     """Shares of pixels."""
 
@@ -91,14 +98,16 @@ def cut_out_people(
     taken = np.zeros(picture.shape[:2], bool)
     for row in chosen:
         shares = _inside_box(_segment(picture, frame, row, taken, ground, backend), labels, row)
-        mask = _remove_specks((shares.full_map("visible", taken.shape) >= 0.5) & ~taken)
+        share = shares.full_map("visible", taken.shape)
+        mask = _remove_specks((share >= _SOLID) & ~taken)
         reasons[row] = _find_flaw(mask, shares, labels.boxes_xyxy[row].tolist())
         if reasons[row]:
             continue
+        reach = _remove_specks(grow_mask(mask, _BORDER + 1) | (share > _TRACE)) & ~taken
         shares = _firm_up(shares, mask)
         pose = labels.translation[row], labels.yaw[row], labels.size_lhw[row]
-        placement = upright.make_placement(mask, labels.kind[row], pose, camera)
-        cuts.append(PersonCutout(row, placement, mask, shares))
+        placement = upright.make_placement(reach, labels.kind[row], pose, camera)
+        cuts.append(PersonCutout(row, placement, mask, reach, shares))
         taken = taken | mask
     return cuts, {row: reason for row, reason in reasons.items() if reason}
 
@@ -168,11 +177,12 @@ def _find_flaw(mask: Mask, shares: Cutout, box_xyxy: list[float]) -> str:
     x0, y0, x1, y1 = box_xyxy
     apart = np.abs(np.subtract(mask_bounds(mask), (x0, y0, x1 + 1, y1 + 1))).max()
     area, count = (x1 - x0) * (y1 - y0), np.count_nonzero(mask)
-    unsure = np.count_nonzero((shares.visible > _UNSURE[0]) & (shares.visible < _UNSURE[1]))
+    unsure = (shares.visible > _UNSURE[0]) & (shares.visible < _UNSURE[1])
+    border = (grow_mask(mask, 2) & ~grow_mask(mask, -2))[shares.window]
+    sure = np.count_nonzero(unsure) <= _MAX_UNSURE * count
+    sure &= np.count_nonzero(unsure & ~border) <= _MAX_UNSURE_INSIDE * count
     filled = _FILLED[0] * area <= count <= _FILLED[1] * area
-    if apart > _SIDE * (y1 - y0) + 2 or not filled or unsure > _MAX_UNSURE * count:
-        return "no clean outline"
-    return ""
+    return "" if sure and filled and apart <= _SIDE * (y1 - y0) + 2 else "no clean outline"
 
 
 def _inside_box(shares: Cutout, labels: Labels, row: int) -> Cutout:

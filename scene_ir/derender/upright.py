@@ -165,10 +165,14 @@ class _OutlineGrid:
         count = [int(np.ceil(n / side)) for n in wide.shape]
         y, x = np.nonzero(wide)
         used = np.zeros(count, bool)
-        used[np.minimum((y / side).astype(int), count[0] - 1), np.minimum((x / side).astype(int), count[1] - 1)] = True
+        used[
+            np.minimum((y / side).astype(int), count[0] - 1), np.minimum((x / side).astype(int), count[1] - 1)
+        ] = True
         used = _without_pinches(used)
         i, j = np.nonzero(used)
-        corners = np.stack([(i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)], axis=1).transpose(2, 1, 0).reshape(-1, 2)
+        corners = (
+            np.stack([(i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)], axis=1).transpose(2, 1, 0).reshape(-1, 2)
+        )
         places, index = np.unique(corners, axis=0, return_inverse=True)
         at = places[:, ::-1] * side - 0.5
         inside = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5)

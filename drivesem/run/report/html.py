@@ -290,7 +290,8 @@ def _graded_tile(run: ReportedRun) -> list[_SummaryTile]:
     if not grading.is_known(run.summary, run.frames):
         return [_SummaryTile("certain failures", "unknown", "the failures of this run are not graded")]
     more = f"{grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared; the others by threshold only. "
-    more += f"Certainly lost: {run.summary.lost_by_grade[str(Grade.CERTAIN)].format(f'{run.summary.noun}s found before')}"
+    lost = run.summary.lost_by_grade[str(Grade.CERTAIN)]
+    more += f"Certainly lost: {lost.format(f'{run.summary.noun}s found before')}"
     return [_SummaryTile("certain failures", f"{grades[Grade.CERTAIN]} of {failures}", more)]
 
 

@@ -43,7 +43,9 @@ def move(space: ParameterSpace, along: float, across: float) -> torch.Tensor:
 
 
 def test_people_walk_two_metres_each_way_with_street_and_their_own_length_with_paper(walk):
-    theta_m = ParameterSpace(walk, ("translate",), STREET).upper * walk.objects.size_lhw[:, :1].expand(2, 2).flatten()
+    theta_m = (
+        ParameterSpace(walk, ("translate",), STREET).upper * walk.objects.size_lhw[:, :1].expand(2, 2).flatten()
+    )
     assert theta_m.tolist() == pytest.approx([2.0, 2.0, 4.0, 1.0])
     assert ParameterSpace(walk, ("translate",)).upper.tolist() == pytest.approx([0.25] * 4)
     narrow = ParameterSpace(walk, ("translate",), parse_budget("street,translate=1m")).upper[:2] * 0.8
