@@ -63,8 +63,9 @@ WEATHER_TOLERANCE = 0.01
 """Tolerance of weather codes and their limits."""
 PEOPLE = (2, 3)
 """Categories of people and cyclists."""
-PEOPLE_TURN, PEOPLE_GROWTH = math.radians(5), 0.05
-"""rad, and share of their size, by which people may change; they do not bend, and have no lamps."""
+PEOPLE_TURN, PEOPLE_GROWTH, PEOPLE_COLOR = math.radians(5), 0.05, 0.5
+"""rad, share of their size, and code of their clothes, by which people may change; they do not bend, and have no
+lamps."""
 LEVEL_SHARE = 0.18
 """Difference of the background's depth from the ground plane's, as a share, up to which a person can stand there."""
 _NIGHT, _SNOW = 4, 5
@@ -261,6 +262,7 @@ class _MeasuredPose:
         self.lattice = objects.ffd[i].detach().double().numpy().reshape(4, 4, 4, 3)
         self.person = int(objects.category[i]) in PEOPLE
         self.lamps = float(objects.lamps[i])
+        self.colour = objects.texture_code[i].detach().double().numpy()
         self.whole = int(objects.occlusion[i]) == 0 and float(objects.truncation[i]) <= MAX_CUT
         forward = np.array([math.cos(self.yaw), 0.0, -math.sin(self.yaw)])
         sideways = np.array([math.sin(self.yaw), 0.0, math.cos(self.yaw)])
@@ -511,6 +513,8 @@ def _shape_violations(old: _MeasuredPose, new: _MeasuredPose, limits: ChangeLimi
         violations.append("size changed, and not alike in length, height and width")
     if old.person and new.lamps != old.lamps:
         violations.append("lamps of a person")
+    if old.person and np.abs(new.colour).max() > max(PEOPLE_COLOR, np.abs(old.colour).max()) + LIMIT_TOLERANCE:
+        violations.append(f"clothes recoloured by {np.abs(new.colour).max():.2f}")
     return violations
 
 
@@ -557,7 +561,10 @@ def _mesh_violations(old: _MeasuredCar, new: _MeasuredCar) -> list[str]:
 
 def _road_violations(base: SceneIR, road: Array, old: _MeasuredCar, new: _MeasuredCar) -> list[str]:
     if old.person and (_road_share(base, road, old, at_feet=True) or 0.0) < 0.5:
-        road = _level_ground(base) * (1 - road)
+        green = base.environment.foliage_map.numpy().astype(np.float64)
+        on_grass = (_road_share(base, green, old, at_feet=True) or 0.0) >= 0.5
+        sure = ((road - 0.5) / 0.3).clip(0, 1)
+        road = _level_ground(base) * (1 - sure) * (1.0 if on_grass else 1 - green)
     before, after = (_road_share(base, road, car) for car in (old, new))
     if before is None or after is None or after >= before - ROAD_LOSS - ROAD_TOLERANCE:
         return []

@@ -260,8 +260,8 @@ def _inside_integral(a: Array, b: Array) -> Array:
     return (np.where(inside, leave - enter, 0.0) * cross).sum(axis=1)
 
 
-_ON_ROAD, _LEVEL_M = 0.5, 0.3
-"""Road map from which a person stands on the road; height over the ground plane up to which ground is level, m."""
+_STANDS_ON, _SURE_ROAD, _LEVEL_M = 0.5, 0.3, 0.3
+"""Share of road, or of grass, from which a person stands on it; how much more makes sure of it; height over the ground plane up to which ground is level, m."""
 _FOOTPRINT_GRID = (10, 16)
 """Cells along and across a footprint; the road map is sampled at their centres."""
 _FOOTPRINT = cell_centres(*_FOOTPRINT_GRID)
@@ -269,16 +269,21 @@ _FOOTPRINT = cell_centres(*_FOOTPRINT_GRID)
 
 
 class RoadMap:
-    """The road of a scene, sampled under footprints. People and cyclists off the road have the level ground
-    there in its place.
+    """The road of a scene, sampled under footprints. People and cyclists off the road have the level ground there in
+    its place; those that do not stand on grass, without what is green: it may be a bush.
     """
 
     def __init__(self, scene: SceneIR) -> None:
         road, upright = to_float64_array(scene.environment.road), scene.objects.upright.cpu().numpy()
-        off_road = upright & (_sample_feet(road, scene) < _ON_ROAD) if upright.any() else upright
-        maps = [road, _level_ground(scene) * (1 - road)] if off_road.any() else [road]
+        maps, kind = [road], np.zeros(len(upright), np.int64)
+        if upright.any():
+            foliage = to_float64_array(scene.environment.foliage_map)
+            level = _level_ground(scene) * (1 - np.clip((road - _STANDS_ON) / _SURE_ROAD, 0, 1))
+            maps += [level * (1 - foliage), level]
+            on_road, on_grass = (_sample_feet(values, scene) >= _STANDS_ON for values in (road, foliage))
+            kind = np.where(upright & ~on_road, 1 + on_grass, 0)
         self._road = np.concatenate([one.reshape(-1) for one in maps])
-        self._start = np.where(off_road, road.size, 0)
+        self._start = kind * road.size
         self._width = scene.camera.width
         self._limit = np.array([scene.camera.width - 1.0, scene.camera.height - 1.0])
 

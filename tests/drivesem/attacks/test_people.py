@@ -55,7 +55,8 @@ def test_people_walk_two_metres_each_way_with_street_and_their_own_length_with_p
 
 
 def test_people_hardly_turn_and_grow_and_have_no_lattice_and_no_lamps(walk):
-    for name, most in (("rotate", math.radians(5)), ("size", 0.05), ("lamps", 0.0), ("mesh", 0.0)):
+    limits = {"rotate": math.radians(5), "size": 0.05, "lamps": 0.0, "mesh": 0.0, "color": 0.5}
+    for name, most in limits.items():
         space = ParameterSpace(walk, (name,), STREET)
         person, car = space.upper.reshape(2, -1).unbind()
         assert person.tolist() == pytest.approx([most] * len(person))
@@ -76,6 +77,17 @@ def test_people_stay_on_level_ground_off_the_road(walk, along, across, blocked):
     assert check_scene(walk, space.apply(walk, projected), "outlines", limits=LIMITS) == []
 
 
+@pytest.mark.parametrize("on_grass", [False, True])
+def test_people_walk_into_nothing_green_unless_they_stand_on_it(walk, on_grass):
+    columns = torch.arange(621).expand(188, 621)
+    green = ((columns < 310 - 360 * 3.5 / 9) if on_grass else (columns < 310 - 360 * 4.4 / 9)).float()
+    scene = walk.with_environment(foliage_map=green)
+    space = ParameterSpace(scene, ("translate",), STREET)
+    theta = move(space, 0.0, 0.8)
+    assert bool(FeasibleSet(space).violations(theta)) != on_grass
+    assert bool(check_scene(scene, space.apply(scene, theta), "outlines", limits=LIMITS)) != on_grass
+
+
 def test_people_do_not_walk_into_cars(walk):
     translation = walk.objects.translation.clone()
     translation[0] = torch.tensor([0.0, 1.65, 11.0])
@@ -94,6 +106,7 @@ def test_people_do_not_walk_into_cars(walk):
         ("lattice bent", {"ffd": 0.01}),
         ("size changed", {"size_lhw": 0.08}),
         ("lamps of a person", {"lamps": [0.5, 0.0]}),
+        ("clothes recoloured", {"texture_code": [[0.0, 0.7, 0.0, 0.0, 0.0], [0.0] * 5]}),
         ("moved by", {"translation": [[0.0, 0.0, 2.2], [0.0, 0.0, 0.0]]}),
     ],
 )
