@@ -63,8 +63,8 @@ WEATHER_TOLERANCE = 0.01
 """Tolerance of weather codes and their limits."""
 PEOPLE = (2, 3)
 """Categories of people and cyclists."""
-PEOPLE_TURN, PEOPLE_GROWTH, PEOPLE_COLOR = math.radians(5), 0.05, 0.5
-"""rad, share of their size, and code of their clothes, by which people may change; they do not bend, and have no
+PEOPLE_TURN, PEOPLE_GROWTH, PEOPLE_COLOR = math.radians(5), 0.05, np.array([0.5, 0.5, 0.5, 0.0, 0.0])
+"""rad, share of their size, and codes of their clothes, by which people may change; they do not bend, and have no
 lamps."""
 LEVEL_SHARE = 0.18
 """Difference of the background's depth from the ground plane's, as a share, up to which a person can stand there."""
@@ -513,7 +513,7 @@ def _shape_violations(old: _MeasuredPose, new: _MeasuredPose, limits: ChangeLimi
         violations.append("size changed, and not alike in length, height and width")
     if old.person and new.lamps != old.lamps:
         violations.append("lamps of a person")
-    if old.person and np.abs(new.colour).max() > max(PEOPLE_COLOR, np.abs(old.colour).max()) + LIMIT_TOLERANCE:
+    if old.person and (np.abs(new.colour) > np.maximum(PEOPLE_COLOR, np.abs(old.colour)) + LIMIT_TOLERANCE).any():
         violations.append(f"clothes recoloured by {np.abs(new.colour).max():.2f}")
     return violations
 

@@ -190,15 +190,15 @@ _MAX_TRUNCATION = 0.1
 """Truncation up to which moved vehicles were compared with the truth (`python -m tools.bench moves`)."""
 
 
-_UPRIGHT_LIMITS = {
-    Parameter.COLOR: 0.5,
+_UPRIGHT_LIMITS: dict[Parameter, float | tuple[float, ...]] = {
+    Parameter.COLOR: (0.5, 0.5, 0.5, 0.0, 0.0),
     Parameter.ROTATE: math.radians(5),
     Parameter.MESH: 0.0,
     Parameter.SIZE: 0.05,
     Parameter.LAMPS: 0.0,
 }
 """Limits of people and cyclists besides the budget's: a surface that faces the camera hardly turns, and has no limbs
-to move; beyond half of the code, clothes lose their folds and patterns."""
+to move; beyond half of the code, clothes lose their folds and patterns, and gloss and dirt are those of paint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,7 +399,8 @@ class ParameterSpace(ThetaSpace[Parameter]):
             self.upper[where] = high
             self.step[where] = getattr(self.steps, parameter.value)
             if specs[parameter].per_object:
-                most, upright = _UPRIGHT_LIMITS.get(parameter, math.inf), scene.objects.upright
+                most = self.upper.new_tensor(_UPRIGHT_LIMITS.get(parameter, math.inf))
+                upright = scene.objects.upright
                 for bound in (self.lower, self.upper):
                     block = bound[where].view(self.count, specs[parameter].size)
                     block[behind_camera(scene)] = 0
