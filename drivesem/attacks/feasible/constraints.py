@@ -261,7 +261,8 @@ def _inside_integral(a: Array, b: Array) -> Array:
 
 
 _STANDS_ON, _SURE_ROAD, _LEVEL_M = 0.5, 0.3, 0.3
-"""Share of road, or of grass, from which a person stands on it; how much more makes sure of it; height over the ground plane up to which ground is level, m."""
+"""Share of road, or of grass, from which a person stands on it; how much more makes sure of it; height over the ground
+plane up to which ground is level, m."""
 _FOOTPRINT_GRID = (10, 16)
 """Cells along and across a footprint; the road map is sampled at their centres."""
 _FOOTPRINT = cell_centres(*_FOOTPRINT_GRID)
