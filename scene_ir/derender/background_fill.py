@@ -17,6 +17,7 @@ from scene_ir.derender import patch_fill, street
 from scene_ir.derender.segmentation import Segmentation
 from scene_ir.derender.silhouette import grow_mask, mask_bounds
 from scene_ir.derender.standing_surfaces import ColumnCopySettings, copy_columns
+from scene_ir.image_filters import push_pull
 from scene_ir.types import Camera
 
 Array = NDArray[np.float32]
@@ -30,6 +31,8 @@ _VEHICLE_SHARE, _MIN_CORE_PX, _AROUND_CORE_PX = 0.97, 150, 150
 """Share and least area of the core of an unlabelled vehicle, and how far its less certain rest extends."""
 _MIN_REST = 0.05
 """A smaller share of all but vehicles carries no information."""
+_SEAM = 0.06
+"""Width of the border along which a person's fill takes the colours around it, in heights."""
 _NEAR_THIN = 1.5
 """Range around a person from which patches are copied, in heights."""
 _BORDER_PX = 5
@@ -159,7 +162,8 @@ class BackgroundFill:
         ground = patch_fill.GroundMaps(np.zeros_like(thin[window]), inputs.maps.ground[window].astype(np.float32))
         image = filled.copy()
         horizon = inputs.horizon - window[0].start
-        image[window] = patch_fill.fill_patches(filled[window], thin[window], forbidden, horizon, ground, seed)
+        patched = patch_fill.fill_patches(filled[window], thin[window], forbidden, horizon, ground, seed)
+        image[window] = _hide_seam(patched, thin[window], _SEAM * (y1 - y0))
         return image
 
     def _fill_hole(self, hole: Mask, seed: int) -> Array:
@@ -197,6 +201,17 @@ class BackgroundFill:
         return street.continue_street(
             coarse.image, unknown, shares, self._coordinates, coarse.inputs.horizon, coarse.shrink
         )
+
+
+def _hide_seam(filled: Array, hole: Mask, width: float) -> Array:
+    """An image (H, W, 3) in which the filled hole (H, W) has the colours around it, smoothed, along its border of this
+    width, px: its contour would remind of what stood there.
+    """
+    around = push_pull(filled, 1 - hole.astype(np.float32))
+    smooth = [cv2.GaussianBlur(part, (0, 0), max(width / 2, 1.0)) for part in (around, filled)]
+    inside = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)
+    weight = (hole * np.exp(-inside / max(width, 1.0)))[..., None]
+    return np.clip(filled + weight * (smooth[0] - smooth[1]), 0, 1).astype(np.float32)
 
 
 def _excluded_pixels(view: _View, unknown: Mask) -> Mask:
