@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import importlib
 import sys
 from collections.abc import Sequence
@@ -45,12 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _load(command: str) -> RunCommand:
     module = next((module for module, names in _MODULES.items() if command in names), command)
-    gc.disable()  # what modules make stays: looking for garbage takes a fifth of their time
-    try:
-        return getattr(importlib.import_module(f"drivesem.commands.{module}"), f"{command}_command")
-    finally:
-        gc.freeze()
-        gc.enable()
+    return getattr(importlib.import_module(f"drivesem.commands.{module}"), f"{command}_command")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,6 +18,7 @@ from detectors.base import (
     Predictor,
     explain_missing_gradient,
     predict,
+    run_in_halves,
 )
 from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.incremental.regions import Rect
@@ -33,11 +34,13 @@ from drivesem.attacks.targets import EvaluatedClasses, TargetSelection, resolve_
 from drivesem.attacks.visibility import VisibilityUnderWeather
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import failures
+from drivesem.failures.feature_cells import CellVisit
 from drivesem.failures.fidelity import find_untrusted
+from drivesem.failures.search_log import ObjectPatches, SearchLog
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.io import round_to_8bit
-from scene_ir.render.compositor import Compositor
+from scene_ir.render.compositor import Compositor, render_batch
 from scene_ir.render.prepare import RenderSettings
 from scene_ir.types import Render, SceneIR
 
@@ -122,6 +125,13 @@ class Objective:
         """Rows of the vehicles that are targeted and not ignored, and of those that are detected at theta = 0."""
         self.whole = config.whole
         self.passes = 1
+        self.search_log = SearchLog()
+        """What was evaluated so far, the benign picture first."""
+        rows = torch.tensor(self.judged, dtype=torch.int64)
+        missed = ~torch.isin(rows, torch.tensor(self.found_before, dtype=torch.int64))
+        self.search_log.record(
+            self.benign.render.image, rows, self.benign.paper.boxes_xyxy[rows], missed, self.passes
+        )
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
         self._scores: dict[bytes, Score] = {}
         self.previews: dict[bytes, Score] = {}
@@ -169,7 +179,7 @@ class Objective:
         loss, value = self.compute_loss(detector, raw, labels.targets)
         with torch.no_grad():
             detections = self.classes.map_detections(_decode(detector, raw))
-        self.previews[_key(theta)] = self.score_image(value, moved, detections)
+        self.previews[_key(theta)] = self.score_image(value, moved, detections, render.image, GRADIENT_PASSES)
         return loss, value
 
     @torch.no_grad()
@@ -217,9 +227,35 @@ class Objective:
         """
         key = _key(theta)
         if key not in self._scores:
-            rendered = self.evaluate(theta)
-            self._scores[key] = self.score_image(rendered.loss, rendered.moved, rendered.detections)
+            self._scores[key] = self._score_evaluation(self.evaluate(theta))
         return self._scores[key]
+
+    def _score_evaluation(self, evaluated: RenderEvaluation) -> Score:
+        return self.score_image(evaluated.loss, evaluated.moved, evaluated.detections, evaluated.render.image)
+
+    @torch.no_grad()
+    def score_ahead(self, thetas: Sequence[Tensor]) -> None:
+        """Score several thetas (D,) and cache the scores. On a GPU their scenes are rendered and detected together; on
+        a CPU, where a picture of several costs as much as alone, they are left for `score`.
+        """
+        new = [theta for theta in thetas if _key(theta) not in self._scores]
+        if len(new) < 2 or not self.space.scene.photograph.is_cuda or not isinstance(self.detector, Detector):
+            return
+        evaluations = run_in_halves(self._evaluate_together, new, "scenes")
+        self.passes += len(new)
+        for theta, evaluated in zip(new, evaluations, strict=True):
+            self._scores[_key(theta)] = self._score_evaluation(evaluated)
+
+    def _evaluate_together(self, thetas: Sequence[Tensor]) -> list[RenderEvaluation]:
+        """Evaluate thetas (D,) in one batch. Their pictures are not cached: they would fill the memory."""
+        scenes = [self.space.apply(self.space.scene, theta) for theta in thetas]
+        renders = render_batch([(self.compositor, scene) for scene in scenes])
+        renders = [replace(render, image=round_to_8bit(render.image)) for render in renders]
+        raw = self.differentiable(torch.stack([render.image for render in renders]))
+        return [
+            self._evaluate_predictions(scene, render, raw.select(i))
+            for i, (scene, render) in enumerate(zip(scenes, renders, strict=True))
+        ]
 
     def preview(self, theta: Tensor) -> Score | None:
         """The score seen by the gradient pass at theta (D,), None without one: of an image that is not rounded to
@@ -227,8 +263,23 @@ class Objective:
         """
         return self.previews.get(_key(theta))
 
-    def score_image(self, loss: float, moved: SceneLabels, detections: Detections) -> Score:
+    def score_image(
+        self, loss: float, moved: SceneLabels, detections: Detections, image: Tensor, passes: int = 1
+    ) -> Score:
+        """The score of a state, which enters the search log.
+
+        Args:
+            loss: the objective.
+            moved: the state's labels.
+            detections: what the detector finds in it.
+            image: (3, H, W), its picture.
+            passes: detector passes that it took.
+        """
         failed = self._failures(moved, detections)
+        rows = torch.tensor(self.found_before, dtype=torch.int64)
+        rows = rows[~moved.ignore[rows]]
+        missed = torch.isin(rows, torch.tensor(failed.lost, dtype=torch.int64))
+        self.search_log.record(image.detach(), rows, moved.boxes_xyxy[rows], missed, passes)
         # The projection treats vehicles as boxes, which may hide others from the start; a render is exact.
         hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
         return Score(
@@ -239,6 +290,11 @@ class Objective:
             success_paper=self._failures(self.labeller.paper(), detections).success and not hidden,
             violations=tuple(f"objects[{i}]: visibility" for i in hidden),
         )
+
+    def cell_visits(self, counterexample: RenderEvaluation) -> tuple[CellVisit, ...]:
+        """Visits of the benign picture and of the search, which ended at a counterexample."""
+        patches = ObjectPatches.from_image(counterexample.render.image, counterexample.moved.boxes_xyxy)
+        return self.search_log.visits(patches.cells())
 
     def feasible_set(self, limits: FeasibilityLimits | None = None, only_bounds: bool = False) -> FeasibleSet:
         """The feasible set of the scene. Weather keeps objects visible as far as `difficulty` requires, and vehicles
@@ -272,6 +328,7 @@ class Objective:
             upper=self.space.upper,
             groups=tuple(self._group(parameter, where) for parameter, where in self.space.blocks.items()),
             preview=self.preview,
+            score_ahead=self.score_ahead,
             keep_last=keep_last,
             margin_oracle=margin_oracle,
         )
@@ -327,6 +384,16 @@ class Objective:
             raise RangeError("detector", "one with a gradient", found)
         return self.detector
 
+    def detect_photograph(self) -> Detections:
+        """Detections in the photograph: those of the benign picture, which is the photograph to the bit unless vehicles
+        were exchanged, added or removed.
+        """
+        photograph = self.space.scene.photograph
+        if torch.equal(self.benign.render.image, photograph):
+            return self.benign.detections
+        self.passes += 1
+        return self.detect(photograph)
+
     @torch.no_grad()
     def detect(self, image: Tensor) -> Detections:
         """Detections of the evaluated classes in an image (3, H, W)."""
@@ -348,10 +415,17 @@ class Objective:
         """Detect and label a rendered state of the scene."""
         # Evaluate what is written: a file holds 8 bits, and so does a camera's picture.
         render = replace(render, image=round_to_8bit(render.image))
+        raw = self.predict(render) if isinstance(self.detector, Detector) else None
+        return self._evaluate_predictions(scene, render, raw)
+
+    def _evaluate_predictions(
+        self, scene: SceneIR, render: Render, raw: AnchorPredictions | None
+    ) -> RenderEvaluation:
+        """Label a state of the scene and decode its predictions; those of a detector without a gradient, for None."""
         paper, moved = self.labeller.paper(), self.labeller.moved(scene, render)
         labels = (moved if self.label_mode == "moved" else paper).targets
-        if isinstance(self.detector, Detector):
-            raw = self.predict(render)
+        if raw is not None:
+            assert isinstance(self.detector, Detector)
             _, loss = self.compute_loss(self.detector, raw, labels)
             detections = self.classes.map_detections(_decode(self.detector, raw))
         else:

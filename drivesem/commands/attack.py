@@ -55,6 +55,7 @@ def _print(summary: RunSummary, console: Console) -> None:
         f"frames broken by threshold: {summary.broken.format('attacked frames')}; feasible {feasible}; "
         f"{format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s",
         summarise_grades(summary),
+        summary.map.describe(),
     )
     for line in lines:
         console.print(line, soft_wrap=True)

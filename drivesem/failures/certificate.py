@@ -193,7 +193,9 @@ class NuisanceCamera:
         is_visible = boxes.area(visible)[:, None] > 0
         visible = torch.where(is_visible, sample.transform_boxes(visible), torch.zeros_like(visible))
         targets = Targets(sample.transform_boxes(truth.boxes_xyxy), truth.labels, ignored)
-        return SampleImage(sample.degrade_image(render.image), targets, visible, sample)
+        image = sample.degrade_image(render.image)
+        sample.noise_field.release()  # outcomes are cached for a whole frame, and none needs the noise again
+        return SampleImage(image, targets, visible, sample)
 
     @torch.no_grad()
     def detect(self, rendered: SampleImage) -> SampleOutcome:

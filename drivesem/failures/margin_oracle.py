@@ -131,8 +131,13 @@ class NuisanceMarginOracle:
         space, sample = self.objective.space, self.sample(number)
         scene = sample.perturb_scene(space.apply(space.scene, theta))
         render = self.objective.compositor.render(scene)
-        candidates = self._find_candidates(sample.degrade_image(render.image), number, render)
-        return self._object_margins(candidates, sample, scene, render, sharpness)
+        image = sample.degrade_image(render.image)
+        candidates = self._find_candidates(image, number, render)
+        rows, boxes_xyxy, margins = self._object_margins(candidates, sample, scene, render, sharpness)
+        passes = 1 if sharpness is None else GRADIENT_PASSES
+        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, margins.detach() < 0, passes)
+        everywhere = margins.new_full((len(self.counted_objects),), torch.inf)
+        return everywhere.index_put((rows.to(margins.device),), margins)
 
     def _find_candidates(self, image: Tensor, number: int, render: Render) -> Candidates:
         if not self.differentiable:
@@ -166,8 +171,8 @@ class NuisanceMarginOracle:
         scene: SceneIR,
         render: Render,
         sharpness: float | None,
-    ) -> Tensor:
-        """(N,); infinite for objects that do not count here, or not in the benign image."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows (K,), boxes (K, 4) px and margins (K,) of the objects that count here and in the benign image."""
         objective, count = self.objective, len(self.counted_objects)
         with torch.no_grad():
             detached = replace(render, image=render.image.detach())
@@ -182,4 +187,4 @@ class NuisanceMarginOracle:
             visible = torch.where(is_visible, sample.transform_boxes(visible), visible)
         labels = targets.labels[rows]
         margins = margin.object_margins(candidates, boxes_xyxy, labels, visible, objective.t_star, sharpness)
-        return margins.new_full((count,), torch.inf).index_put((rows.to(margins.device),), margins)
+        return rows, boxes_xyxy, margins

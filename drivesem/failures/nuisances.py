@@ -157,6 +157,15 @@ class NoiseField:
             self._values = torch.randn(image.shape, generator=torch.Generator().manual_seed(self._seed))
         return self._values.to(image)
 
+    @property
+    def cached_mb(self) -> float:
+        """Size of the cached noise."""
+        return 0.0 if self._values is None else self._values.nbytes / 1e6
+
+    def release(self) -> None:
+        """Release the cached noise, which is drawn again when needed."""
+        self._values = None
+
 
 @dataclass(frozen=True, slots=True)
 class NuisanceSample:

@@ -45,6 +45,7 @@ from drivesem.failures.grading import Grader, make_reference_detector
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
 from drivesem.reporting.tables import format_count
+from drivesem.run.allocation import release_freed_memory
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from drivesem.run.finished import MANIFEST, METRICS, AttackRun, build_manifest, hash_json, load_runs
 from drivesem.run.folder import FRAMES, PLAN, claim_folder, load_run_detector, load_trusted_config, result_settings
@@ -273,6 +274,7 @@ class AttackInstance:
             nuisances: nuisances of the margins.
         """
         objective = Objective.from_config(scene, detector, config)
+        release_freed_memory()  # stages differ in what they allocate, and holes between long-lived blocks add up
         oracle = NuisanceMarginOracle.for_objective(objective, nuisances, f"search:{identifier}:{config.seed}")
         feasible = objective.feasible_set(only_bounds=config.project == "bounds")
         return cls(oracle, feasible, objective.problem(feasible, config.keep == "last", oracle))
@@ -364,9 +366,10 @@ class AttackWorker:
             instance.margin_oracle.clear_cache()
             objective = instance.objective
             evaluation = objective.evaluate(result.theta)
-            benign = objective.detect(scene.photograph)
-            passes = objective.passes + 1 + other_passes
+            benign = objective.detect_photograph()
+            passes = objective.passes + other_passes
             search_end = time.perf_counter()
+            release_freed_memory()
             failures, notes = grade_failures(
                 identifier,
                 objective,
@@ -390,6 +393,7 @@ class AttackWorker:
             failures=failures,
             grade_notes=notes,
             passes=passes,
+            visits=objective.cell_visits(evaluation),
             seconds=end - start,
             grading_seconds=end - search_end,
         )
@@ -435,6 +439,7 @@ def _choose_change(
     all_passes = best_passes = unchanged.margin_oracle.passes
     for proposal in proposals:
         space, oracle = proposal.objective.space, proposal.margin_oracle
+        proposal.objective.search_log = unchanged.objective.search_log
         same_theta = space.convert_theta(unchanged.objective.space, result.theta)
         proposal_theta = proposal.problem.project(same_theta).theta
         margin = proposal.held_out_margin(proposal_theta)

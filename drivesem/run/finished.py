@@ -351,7 +351,7 @@ VOLATILE_KEYS = ("out", "seconds")
 HASHED_RUN_FIELDS = ("data", "frames_without_vehicles", "frames_failed")
 HASHED_FRAME_FIELDS = (
     *("loss_trace", "queries", "passes", "active_constraints", "violated_at_start", "became_ignored"),
-    *("judged", "found_before", "failures", "grade_notes", "checked_by", "change"),
+    *("judged", "found_before", "failures", "grade_notes", "checked_by", "change", "visits"),
 )
 """Values of metrics.json and result.json that do not follow from other files. Each has its own hash, so that a change
 can be named."""

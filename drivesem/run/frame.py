@@ -27,9 +27,11 @@ from drivesem.evaluation import coco
 from drivesem.evaluation.failures import FrameFailures
 from drivesem.evaluation.resampling import Proportion
 from drivesem.failures.certificate import CompositorRenderer, pad_visible_boxes
+from drivesem.failures.feature_cells import CellVisit
 from drivesem.failures.grades import Grade, Kind
 from drivesem.failures.grading import FrameGrades, GradedFault, Grader, GradingInput
 from drivesem.failures.kinds import OBJECT_KINDS, LabelledDetections
+from drivesem.run.feature_map import FailureMap
 from drivesem.run.labels import RESULT
 from drivesem.run.report import pictures
 from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, VehicleCounts, dump_frame
@@ -61,6 +63,8 @@ class AttackedScene:
     """Why a grade could not be reached."""
     passes: int
     """Detector passes, a gradient counted as 3."""
+    visits: tuple[CellVisit, ...]
+    """Where in feature space the objects were evaluated."""
     seconds: float
     """Total time."""
     grading_seconds: float
@@ -128,6 +132,7 @@ def frame_result(attacked: AttackedScene, perturbed: SceneIR) -> FrameResult:
         min_contrast=objective.difficulty.min_contrast,
         joint_weather=True,
         change=change,
+        visits=attacked.visits,
     )
 
 
@@ -442,6 +447,13 @@ def count_grades(results: Sequence[FrameResult]) -> dict[str, Any]:
     }
 
 
+def build_map(results: Sequence[FrameResult]) -> FailureMap:
+    """Build the map of frames with judged vehicles."""
+    return FailureMap.from_frames(
+        [(r.visits, {failure.index for failure in certain_losses(r)}) for r in results if r.judged]
+    )
+
+
 def count_objects(results: Sequence[FrameResult]) -> dict[str, Any]:
     """Count vehicles: those that are judged, found before, missed before, and lost."""
     judged, found = sum(len(r.judged) for r in results), sum(len(r.found_before) for r in results)
@@ -495,5 +507,6 @@ def summarise_frames(
         "successes_moved": sum(r.success_moved for r in results),
         "feasible_fraction": sum(r.feasible for r in attacked) / len(attacked) if attacked else None,
         "queries": sum(r.queries for r in results),
+        "map": build_map(results),
         **count_grades(results),
     }

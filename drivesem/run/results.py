@@ -10,9 +10,11 @@ from typing import Any, Literal
 
 from drivesem.evaluation.coco import CocoScores
 from drivesem.evaluation.resampling import Proportion
+from drivesem.failures.feature_cells import CellVisit
 from drivesem.failures.fidelity import ObjectFidelity
 from drivesem.failures.grades import Certificate, SecondOpinion
 from drivesem.reporting.tables import format_count
+from drivesem.run.feature_map import FailureMap
 from drivesem.run.records import dump_record, load_record
 from scene_ir.errors import FormatError
 
@@ -163,6 +165,8 @@ class FrameResult:
     """Reasons why a grade could not be reached."""
     change: str = ""
     """Description of an exchanged, added or removed vehicle; empty if none."""
+    visits: tuple[CellVisit, ...] = ()
+    """Where in feature space the search has evaluated the judged objects."""
 
     @property
     def feasible(self) -> bool:
@@ -266,6 +270,8 @@ class RunSummary:
     """Run time."""
     data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Files and label rows of the data set, and what became of them; empty for generated scenes."""
+    map: FailureMap = dataclasses.field(default_factory=FailureMap)
+    """Which features were searched, what fails there, and what is known to hold."""
 
     @property
     def noun(self) -> str:
@@ -294,6 +300,7 @@ class RunSummary:
             "broken": dataclasses.asdict(self.broken),
             "objects": dataclasses.asdict(self.objects),
             "missed_before": dataclasses.asdict(self.missed_before),
+            "map": dataclasses.asdict(self.map),
             "lost_by_grade": {grade: dataclasses.asdict(share) for grade, share in self.lost_by_grade.items()},
             "benign": self.benign.to_json(),
             "rerendered": self.rerendered.to_json(),

@@ -25,6 +25,8 @@ _PATTERN = np.array([(dy, dx) for dy in _STEPS for dx in _STEPS if abs(dy) + abs
 _RADIUS = 3
 _SIDEWAYS = 0.4
 """Factor on sideways distances in the initial guess."""
+_CHUNK = 4096
+"""Patches compared at a time, which bounds memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,6 +302,13 @@ class _Level:
         self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> NDArray[np.float32]:
         """Cost of source positions for the targets `which`; infinite where copying is not allowed."""
+        parts = [slice(start, start + _CHUNK) for start in range(0, which.size, _CHUNK)]
+        costs = [self._chunk_cost(which[part], rows[part], columns[part]) for part in parts]
+        return np.concatenate(costs) if costs else np.zeros(0, np.float32)
+
+    def _chunk_cost(
+        self, which: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
         difference = self._patches(rows, columns) - self.target_patches[which]
         colour = np.einsum("pk,pk,pk->p", difference, difference, self.trust[which])
         dy = (rows - self.rows[which]) / self.reach[which]

@@ -191,8 +191,10 @@ def build_texels(
     covered = torch.isfinite(mesh_depth.values)
     padded = extract_crop(Crop(covered.to(rgba), mesh_depth.x0, mesh_depth.y0), window, frame_hw)[0] > 0.5
     finite = torch.where(covered, mesh_depth.values, torch.zeros_like(mesh_depth.values)).to(rgba)
-    depth = extend_nearest(extract_crop(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw), padded)
-    depth = torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
+    known = extract_crop(Crop(finite, mesh_depth.x0, mesh_depth.y0), window, frame_hw)
+    deepest = _deepest_neighbour(extend_nearest(known, padded))
+    # A halo moves with its nearest piece of outline, which takes a part of its depth from its neighbours.
+    depth = torch.maximum(deepest, extend_nearest(_deepest_neighbour(known * padded), padded))
     inside = np.pad(padded.cpu().numpy().astype(np.uint8), 1, mode="edge")
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, 5)[1:-1, 1:-1]
     inset = torch.from_numpy(np.ascontiguousarray(distance)).to(rgba).clamp(max=_DEEP_PX)
@@ -200,6 +202,11 @@ def build_texels(
     support = torch.nn.functional.max_pool2d(rgba[3:][None], pool, stride=1, padding=model.SUPPORT_PX)[0]
     values = torch.cat([rgba, extract_crop(frame, window, frame_hw).to(rgba), inset[None], depth, support])
     return Crop(values, x0, y0)
+
+
+def _deepest_neighbour(depth: Tensor) -> Tensor:
+    """Largest depth (1, h, w) of each pixel and the eight around it."""
+    return torch.nn.functional.max_pool2d(depth[None], 3, stride=1, padding=1)[0]
 
 
 def extend_nearest(values: Tensor, known: Tensor) -> Tensor:

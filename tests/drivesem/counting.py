@@ -6,7 +6,13 @@ from detectors.types import CLASSES
 from drivesem.attacks.targets import HEADLINE
 from drivesem.config.commands import AttackConfig
 from drivesem.evaluation import coco
-from drivesem.run.frame import count_grades, count_objects, detections_from_records, targets_from_records
+from drivesem.run.frame import (
+    build_map,
+    count_grades,
+    count_objects,
+    detections_from_records,
+    targets_from_records,
+)
 from drivesem.run.results import FrameResult, RunSummary
 
 T_STAR = 0.5
@@ -47,6 +53,7 @@ def summary_of(config: AttackConfig, results: Sequence[FrameResult]) -> RunSumma
         successes_moved=sum(r.success_moved for r in results),
         feasible_fraction=1.0,
         queries=sum(r.queries for r in results),
+        map=build_map(results),
         **count_grades(results),
         seconds=0.0,
     )

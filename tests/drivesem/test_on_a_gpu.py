@@ -15,6 +15,7 @@ import torch
 
 from detectors.registry import load_detector
 from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.methods.gradient_free import Sampling
 from drivesem.attacks.objective import Objective
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
@@ -165,6 +166,29 @@ def test_samples_of_a_state_are_detected_together(tmp_path: Path, monkeypatch: p
         found, expected = (one.labelled.detections for one in (other, mine))
         np.testing.assert_allclose(np.asarray(found.scores.tolist()), expected.scores, atol=1e-3)
         assert other.outcome.detected.tolist() == mine.outcome.detected.tolist()
+
+
+def test_a_population_is_scored_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(["attack", "--combo", "1", "--steps", "1", "--no-grade", "--limit", "1"], tmp_path / "run", "cpu")
+    (folder,) = (tmp_path / "run").glob("frames/*/scene")
+
+    def scores(device: str) -> tuple[list[tuple[float, ...]], list[int], int]:
+        detector, sizes = load_detector("squeezedet", device), list[int]()
+        state = convert_scene(load_scene(folder), None, device)
+        objective = Objective.from_config(state, detector, AttackConfig(combo=1))
+        problem = objective.problem(objective.feasible_set())
+        forward = detector.forward
+        monkeypatch.setattr(detector, "forward", lambda images: (sizes.append(len(images)), forward(images))[1])
+        result = Sampling(queries=5, kind="halton")(problem, objective.space.theta0)
+        return [result.loss_trace, tuple(result.theta.tolist())], sizes, objective.passes
+
+    (here, theta), _, passes = scores("cpu")
+    with pretended():
+        (there, on_gpu), sizes, passes_on_gpu = scores("cuda")
+    assert sizes[0] == 5
+    assert passes_on_gpu == passes == 6  # and the benign one
+    assert there == pytest.approx(here, abs=1e-3)
+    assert on_gpu == pytest.approx(theta, abs=1e-6)
 
 
 @pytest.mark.slow

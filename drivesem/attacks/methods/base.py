@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, final
 
@@ -17,7 +17,10 @@ from scene_ir.errors import RangeError
 GRADIENT_PASSES = 3
 """Cost of a gradient, in forward passes of the network."""
 MAX_RESCORED = 5
-"""Number of iterates with a preview that are rendered and scored: the most promising ones."""
+"""Maximum number of iterates with a preview that are rendered and scored: the most promising ones."""
+_PREVIEW_ERROR = 0.05
+"""Share by which a score's loss may exceed its preview's, which is of a picture not rounded to 8 bits: of 165 iterates
+of generated streets and photographs, two did by more, 0.051 and 0.052."""
 _TINY = 1e-30
 """Keeps a division defined where its result is not used."""
 
@@ -56,6 +59,10 @@ def check_rate(rate: float, name: str = "rate") -> None:
     """Raise RangeError for a rate that is not positive."""
     if not (math.isfinite(rate) and rate > 0):
         raise RangeError(name, "a positive number", rate)
+
+
+def _score_later(thetas: Sequence[Tensor]) -> None:
+    return None
 
 
 def _no_preview(theta: Tensor) -> Score | None:
@@ -140,6 +147,8 @@ class Problem:
     """theta (D,) after a move (D,) from a theta; gradients are those of the loss in the move, at 0."""
     preview: Callable[[Tensor], Score | None] = _no_preview
     """Free estimate of `score` from the gradient pass at theta; None without such a pass."""
+    score_ahead: Callable[[Sequence[Tensor]], None] = _score_later
+    """Called with feasible thetas that `score` gets next; scores them together where that is faster."""
     keep_last: bool = False
     """Return the last iterate instead of the best one."""
     margin_oracle: MarginOracle | None = None
@@ -267,7 +276,8 @@ class Attack(ABC):
         """Run from theta0 (D,) and select the highest-ranked theta (`_rank`) of theta0 and the proposals.
 
         Proposals are projected and scored; ties go to the first, and infeasible renders rank below all others. Of
-        proposals with a preview only the MAX_RESCORED with the highest previewed rank are scored.
+        proposals with a preview at most the MAX_RESCORED with the highest previewed rank are scored, as long as one
+        may still win.
 
         Args:
             problem: the scene and network.
@@ -282,11 +292,10 @@ class Attack(ABC):
             feasible = problem.project(candidate.detach())
             if not any(torch.equal(feasible.theta, other.theta) for other in projected):
                 projected.append(feasible)
-        projected = self._select_promising(problem, projected)
-        scores = [problem.score(p.theta) for p in projected]
-        ranks = [self._full_rank(problem, p.theta, score) for p, score in zip(projected, scores, strict=True)]
-        best = max(range(len(ranks)), key=lambda i: (*ranks[i], -i))
-        violations = [name for score in scores for name in score.violations]
+        scores = self._score_promising(problem, projected)
+        ranks = {i: self._full_rank(problem, projected[i].theta, score) for i, score in scores.items()}
+        best = max(ranks, key=lambda i: (*ranks[i], -i))
+        violations = [name for _, score in sorted(scores.items()) for name in score.violations]
         score = scores[best]
         trace = [loss for loss in proposals.losses if loss is not None]
         return AttackResult(
@@ -306,12 +315,21 @@ class Attack(ABC):
     def _full_rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
         return (float(not score.violations), *self._rank(problem, theta, score))
 
-    def _select_promising(self, problem: Problem, projected: list[ProjectedTheta]) -> list[ProjectedTheta]:
-        """The candidates to render and score, in order; always includes the first, which is theta0."""
+    def _score_promising(self, problem: Problem, projected: list[ProjectedTheta]) -> dict[int, Score]:
+        """Scores of the candidates that may win, by their place: those without a preview, which include theta0, then
+        the others by their previewed rank, until none left can reach the best score.
+        """
         previews: dict[int, tuple[float, ...]] = {}
         for i, candidate in enumerate(projected[1:], start=1):
             preview = problem.preview(candidate.theta)
             if preview is not None:
                 previews[i] = self._full_rank(problem, candidate.theta, preview)
-        best = sorted(previews, key=lambda i: (previews[i], -i), reverse=True)[:MAX_RESCORED]
-        return [candidate for i, candidate in enumerate(projected) if i not in previews or i in best]
+        scores = {i: problem.score(one.theta) for i, one in enumerate(projected) if i not in previews}
+        best = max(self._full_rank(problem, projected[i].theta, score) for i, score in scores.items())
+        for i in sorted(previews, key=lambda i: (previews[i], -i), reverse=True)[:MAX_RESCORED]:
+            *failures, loss = previews[i]
+            if (*failures, loss + _PREVIEW_ERROR * abs(loss)) < best:
+                break
+            scores[i] = problem.score(projected[i].theta)
+            best = max(best, self._full_rank(problem, projected[i].theta, scores[i]))
+        return scores

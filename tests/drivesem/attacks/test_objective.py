@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -67,6 +68,18 @@ def _objective(scene, detector, mode="moved", **settings):
     space = ParameterSpace(scene, ("translate",))
     config = AttackConfig(objective_labels=mode, **{"objective": "confidence", **settings})
     return Objective(StubCompositor(), space, detector, config, ALL_TARGETS)
+
+
+def test_a_photograph_is_detected_unless_it_is_the_benign_picture(street):
+    scene = street(positions_xz=NEAR, dtype=torch.float64)
+    objective = _objective(scene, StubDetector(scene.objects.box2d))
+    passes = objective.passes
+    assert len(objective.detect_photograph()) == len(NEAR)  # the stub's picture is not the photograph
+    assert objective.passes == passes + 1
+    same = replace(objective.benign, render=replace(objective.benign.render, image=scene.photograph))
+    objective.benign = same
+    assert objective.detect_photograph() is same.detections
+    assert objective.passes == passes + 1
 
 
 def test_loss_and_gradient_are_those_of_the_whole_chain(street):

@@ -78,6 +78,41 @@ def test_metrics(finished: Path) -> None:
     assert metrics["rerendered"]["ap50"] == pytest.approx(metrics["benign"]["ap50"], abs=0.01)
 
 
+def test_map(finished: Path) -> None:
+    metrics = json.loads((finished / "metrics.json").read_text())
+    found, objects = metrics["map"], metrics["objects"]["judged"]
+    cells = found["cells"]
+    assert found["searched"] == len(cells) > 0
+    assert found["failing"] == sum(cell["state"] == "failing" for cell in cells)
+    assert found["clear"] == 0  # of two frames
+    assert sum(cell["objects"] for cell in cells) >= objects
+    certain = {
+        (name, f.index)
+        for name in ("demo-000", "demo-001")
+        for f in load_frame(finished / "frames" / name / "result.json").failures
+        if f.grade not in (None, "threshold") and f.kind == "lost"
+    }
+    assert sum(cell["certain"] for cell in cells) == len(certain)
+    page = (finished / "report.html").read_text()
+    assert all(f'<td class="{cell["state"]}">' in page for cell in cells)
+
+
+@pytest.mark.parametrize("method", ["halton", "climb", "fgsm", "si-fgsm"])
+def test_the_map_counts_all_passes(method: str, tmp_path: Path) -> None:
+    """Of the search alone: the photograph as a file and what is rendered again for the result are not part of it."""
+    words = ["--method", method, "--params", "color,translate", "--no-grade", "--limit", "1"]
+    run_json("attack", *words, *(["--steps", "3"] if "fgsm" in method else ["--passes", "30"]), "--out", tmp_path)
+    result = load_frame(tmp_path / "frames" / "demo-000" / "result.json")
+    assert {visit.index for visit in result.visits} == set(result.judged)
+    assert result.passes is not None
+    passes = max(sum(v.passes for v in result.visits if v.index == row) for row in result.found_before)
+    assert result.passes - 3 <= passes <= result.passes
+    missed_before = set(result.judged) - set(result.found_before)
+    assert all(sum(v.misses for v in result.visits if v.index == row) == 1 for row in missed_before)
+    lost = {failure.index for failure in result.failures if failure.kind == "lost"}
+    assert {visit.index for visit in result.visits if visit.final and visit.misses} >= lost
+
+
 def test_folder(finished: Path) -> None:
     for name in ("demo-000", "demo-001"):
         folder = finished / "frames" / name

@@ -175,3 +175,16 @@ def test_a_sample_moves_the_labels() -> None:
         visible = seen.labelled.visible_xyxy[largest]
         torch.testing.assert_close(visible, seen.labelled.detections.boxes_xyxy[0], atol=1.6, rtol=0)
         assert bool(seen.outcome.detected[largest])
+
+
+def test_outcomes_hold_no_image_of_noise() -> None:
+    """A frame's outcomes are cached, and at 1280 x 720 px each noise takes 11 MB."""
+    scene = demo_scene(0, 0)
+    compositor = Compositor(scene)
+    drawn = CompositorRenderer(compositor, Labeller(scene, compositor.render(scene)))
+    camera = NuisanceCamera(drawn, Sees(), 0.5, Nuisances(), "test")
+    outcome = camera.evaluate(scene, 0, torch.zeros(len(scene.objects), dtype=torch.bool))
+    assert outcome.sample.noise > 0
+    assert outcome.sample.noise_field.cached_mb == 0
+    outcome.sample.noise_field.like(scene.photograph)
+    assert outcome.sample.noise_field.cached_mb > 0

@@ -179,14 +179,30 @@ def test_only_the_most_promising_previews_are_scored() -> None:
         return score_of(float(theta))
 
     def preview(theta: Tensor) -> Score | None:
-        # The last iterate has no preview. The 4th promises a lost object, later ones a higher loss.
+        # The last iterate has no preview. The 4th promises a lost object, later ones a slightly higher loss.
         k = round(float(theta))
-        return None if k == 20 else score_of(float(k), int(k == 4))
+        return None if k == 20 else score_of(20 + k / 100, int(k == 4))
 
     result = SiFGSM(steps=20)(make_problem(torch.sum, (1.0,), score=score, preview=preview), torch.zeros(1))
-    assert sorted(scored) == [0, 4, 16, 17, 18, 19, 20]
+    assert scored == [0, 20, 4, 19, 18, 17, 16]
     assert len(scored) == MAX_RESCORED + 2
     assert float(result.theta) == 20
+
+
+def test_previews_that_cannot_win_are_not_scored() -> None:
+    """The 10th and the 9th promise a lost object: the first turns out to have none, and the second has one."""
+    scored: list[float] = []
+
+    def score(theta: Tensor) -> Score:
+        scored.append(float(theta))
+        return score_of(float(theta), int(theta == 9))
+
+    def preview(theta: Tensor) -> Score:
+        return score_of(float(theta), int(theta >= 8 if theta <= 10 else 0))
+
+    result = SiFGSM(steps=20)(make_problem(torch.sum, (1.0,), score=score, preview=preview), torch.zeros(1))
+    assert scored == [0, 10, 9]  # the 8th has a lower loss, by more than a preview's error
+    assert float(result.theta) == 9
 
 
 @pytest.mark.parametrize(

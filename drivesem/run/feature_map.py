@@ -1,0 +1,142 @@
+"""The map of a run: which cells of features its search visited, what fails there, and what is known to hold.
+
+The unit of every share is the frame: objects of one picture and passes on it are not independent. The bound of a cell
+is the one-sided 95 % limit of Clopper and Pearson on the share of frames in which such a search sees an object of the
+cell missed, of the frames that have one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from drivesem.failures.feature_cells import CELL_EDGES, LEVEL_NAMES, Cell, CellVisit
+from drivesem.reporting.tables import format_count
+
+LEVEL = 0.95
+"""Confidence of bounds."""
+CLEAR_BELOW = 0.1
+"""Bound below which a cell is clear: no miss in 29 frames, or one in 46."""
+CellState = Literal["failing", "clear", "missed", "unknown"]
+"""failing: certain failures; clear: none, and a bound under `CLEAR_BELOW`; missed: misses that are not certain;
+unknown: no miss, but too few frames."""
+CELLS = tuple(itertools.product(*(range(len(edges) + 1) for edges in CELL_EDGES.values())))
+"""All cells."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapCell:
+    """What a run knows of one cell."""
+
+    where: dict[str, str]
+    """Name of its level by feature."""
+    state: CellState
+    """What is known."""
+    objects: int
+    """Objects that lay in it, as photographed or after a change."""
+    frames: int
+    """Frames with such an object."""
+    passes: int
+    """Detector passes with an object in it, for each of its objects; a gradient counts as 3."""
+    frames_missed: int
+    """Frames of these in which such an object was missed in any pass."""
+    missed_below: float
+    """One-sided 95 % upper limit on the share of such frames, in [0, 1]."""
+    certain: int
+    """Objects that are lost for certain in it."""
+
+    def describe(self) -> str:
+        """Such as `under 40 px, low contrast, left, dark: 3 certain of 12 objects`."""
+        return f"{', '.join(self.where.values())}: {self.finding}"
+
+    @property
+    def finding(self) -> str:
+        """The evidence in one line."""
+        if self.state == "failing":
+            return f"{self.certain} certain of {format_count(self.objects, 'object')}"
+        missed = f"{self.frames_missed} of {format_count(self.frames, 'frame')}"
+        return f"{missed}, under {100 * self.missed_below:.2g} %" if self.state == "clear" else missed
+
+
+@dataclass(frozen=True, slots=True)
+class FailureMap:
+    """The map of a run."""
+
+    cells: tuple[MapCell, ...] = ()
+    """Visited cells, in the order of `CELLS`."""
+    searched: int = 0
+    """Number of visited cells."""
+    failing: int = 0
+    """Of these, failing ones."""
+    clear: int = 0
+    """Of these, clear ones."""
+    frames_without_record: int = 0
+    """Frames left out, as the version that attacked them has no record of the search."""
+
+    @classmethod
+    def from_frames(cls, frames: Sequence[tuple[Sequence[CellVisit], Collection[int | None]]]) -> FailureMap:
+        """Build the map of a run's frames with judged vehicles: the visits of each frame, and the objects that are
+        lost for certain in its counterexample.
+        """
+        known = [(visits, certain) for visits, certain in frames if visits]
+        by_cell = {cell: _map_cell(cell, known) for cell in sorted({v.cell for vs, _ in known for v in vs})}
+        states = [cell.state for cell in by_cell.values()]
+        counts = (states.count("failing"), states.count("clear"), len(frames) - len(known))
+        return cls(tuple(by_cell.values()), len(by_cell), *counts)
+
+    @property
+    def columns(self) -> list[tuple[str, str]]:
+        """Light and place of each column of `grid`."""
+        return list(itertools.product(LEVEL_NAMES["light"], LEVEL_NAMES["across"]))
+
+    def grid(self) -> list[tuple[str, str, list[MapCell | None]]]:
+        """Rows of a table: size, contrast, and the cells of all places in the dark, then in bright light; None where
+        nothing was searched.
+        """
+        by_levels = {tuple(cell.where.values()): cell for cell in self.cells}
+        rows = itertools.product(LEVEL_NAMES["height_px"], LEVEL_NAMES["contrast"])
+        return [
+            (size, contrast, [by_levels.get((size, contrast, place, light)) for light, place in self.columns])
+            for size, contrast in rows
+        ]
+
+    def describe(self) -> str:
+        """Describe the map in one line."""
+        failing = max((cell for cell in self.cells if cell.certain), key=lambda cell: cell.certain, default=None)
+        worst = f" (most: {failing.describe()})" if failing else ""
+        left_out = format_count(self.frames_without_record, "frame")
+        return (
+            f"map: {self.searched} of {len(CELLS)} cells of size, contrast, place and light searched; "
+            f"{self.failing} failing{worst}, {self.clear} clear (misses in under {100 * CLEAR_BELOW:.0f} % of frames)"
+            f"{f'; {left_out} without a record of the search' if self.frames_without_record else ''}"
+        )
+
+
+def upper_limit(found: int, count: int) -> float:
+    """One-sided 95 % upper limit of a proportion (Clopper and Pearson 1934): of 0 out of 59 it is 5 %."""
+    from scipy.special import betaincinv  # imported on use: it takes a tenth of a second
+
+    return 1.0 if found >= count else float(betaincinv(found + 1, count - found, LEVEL))
+
+
+def _map_cell(cell: Cell, frames: Sequence[tuple[Sequence[CellVisit], Collection[int | None]]]) -> MapCell:
+    here = [([v for v in visits if v.cell == cell], certain) for visits, certain in frames]
+    here = [(visits, certain) for visits, certain in here if visits]
+    missed = sum(any(visit.misses for visit in visits) for visits, _ in here)
+    lost = sum(visit.final and visit.index in certain for visits, certain in here for visit in visits)
+    limit = upper_limit(missed, len(here))
+    state: CellState = "missed" if missed else "unknown"
+    if lost or limit < CLEAR_BELOW:
+        state = "failing" if lost else "clear"
+    return MapCell(
+        where={name: LEVEL_NAMES[name][level] for name, level in zip(CELL_EDGES, cell, strict=True)},
+        state=state,
+        objects=sum(len(visits) for visits, _ in here),
+        frames=len(here),
+        passes=sum(visit.passes for visits, _ in here for visit in visits),
+        frames_missed=missed,
+        missed_below=round(limit, 4),
+        certain=lost,
+    )

@@ -1,0 +1,56 @@
+"""Cells of features, and the visits of a search to them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from detectors.planted import compute_features
+from drivesem.failures.search_log import ObjectPatches, SearchLog
+
+BOXES = torch.tensor([[10.0, 20, 90, 50], [300, 30, 400, 130]])
+SMALL_LEFT, LARGE_RIGHT = (0, 1, 0, 1), (2, 1, 2, 1)
+
+
+def picture(light: float = 0.5) -> torch.Tensor:
+    """Grey noise (3, 200, 420), with a contrast of 0.15."""
+    noise = torch.randn(1, 200, 420, generator=torch.Generator().manual_seed(0))
+    return (light + 0.15 * noise).expand(3, -1, -1)
+
+
+def test_cells_of_two_boxes() -> None:
+    assert ObjectPatches.from_image(picture(), BOXES).cells() == [SMALL_LEFT, LARGE_RIGHT]
+    assert [cell[3] for cell in ObjectPatches.from_image(picture(0.1), BOXES).cells()] == [0, 0]
+    assert ObjectPatches.from_image(picture(), BOXES[:0]).cells() == []
+
+
+def test_a_box_beyond_the_picture_is_cut_off() -> None:
+    beyond = torch.tensor([[-50.0, 20, 90, 50]])
+    inside = torch.tensor([[0.0, 20, 90, 50]])
+    found, expected = (ObjectPatches.from_image(picture(), box) for box in (beyond, inside))
+    assert torch.equal(found.box_features, expected.box_features)
+    assert torch.equal(found.pixels, expected.pixels)
+
+
+def test_the_grid_has_the_contrast_of_the_whole_box() -> None:
+    whole = compute_features(picture()[None], BOXES[None], ("contrast",))[0, 0]
+    patches = ObjectPatches.from_image(picture(), BOXES)
+    sides = torch.tensor([0.0, 0, 15, 15]).expand(2, 1, 4)
+    grid = compute_features(patches.pixels, sides, ("contrast",))[0, :, 0]
+    assert grid.tolist() == pytest.approx(whole.tolist(), rel=0.1)
+
+
+def test_visits_count_passes_and_misses_by_object_and_cell() -> None:
+    log = SearchLog()
+    both = torch.tensor([0, 4])
+    log.record(picture(), both, BOXES, torch.tensor([False, True]), passes=1)
+    log.record(picture(), both[1:], BOXES[1:], torch.tensor([True]), passes=3)
+    log.record(picture(0.1), both[:1], BOXES[:1], torch.tensor([True]), passes=1)
+    log.record(picture(), both[:0], BOXES[:0], torch.zeros(0, dtype=torch.bool), passes=1)
+    found = [
+        (visit.index, visit.cell, visit.passes, visit.misses, visit.final)
+        for visit in log.visits([SMALL_LEFT, SMALL_LEFT])
+    ]
+    dark = (0, 1, 0, 0)
+    assert found == [(0, dark, 1, 1, False), (0, SMALL_LEFT, 1, 0, True), (4, LARGE_RIGHT, 4, 2, False)]
+    assert SearchLog().visits([]) == ()
