@@ -65,6 +65,10 @@ class Category(IntEnum):
     CYCLIST = 3
 
 
+UPRIGHT = (Category.PEDESTRIAN, Category.CYCLIST)
+"""Objects without a solid mesh: an upright surface, cut out of the photograph, stands for each."""
+
+
 def check_shape(name: str, tensor: Tensor, *shape: int | None, floating: bool = True) -> None:
     """Check a tensor's shape and kind of dtype.
 
@@ -252,7 +256,7 @@ class Occluder:
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """N vehicles."""
+    """N vehicles, and people and cyclists among them."""
 
     mesh_index: Tensor
     """(N,) int64, into `SceneIR.meshes`."""
@@ -303,6 +307,11 @@ class Objects:
 
     def __len__(self) -> int:
         return int(self.translation.shape[0])
+
+    @property
+    def upright(self) -> Tensor:
+        """(N,) bool, which are upright surfaces, not vehicles."""
+        return torch.isin(self.category, self.category.new_tensor(UPRIGHT))
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
     python tools/fetch_assets.py build/assets
     python tools/train_cutout.py --assets build/assets
+    python tools/train_cutout.py --people --out scene_ir/derender/weights/people.safetensors
 
 Streets are generated first, in `--run`. A run resumes from its last checkpoint, to the same bytes as one that
 was never stopped (one thread, one machine).
@@ -38,7 +39,7 @@ from drivesem.synth.layout import LayoutSettings
 from drivesem.synth.soup import Semantic
 from drivesem.synth.view import blocks
 from scene_ir import files
-from scene_ir.derender import cutout, silhouette
+from scene_ir.derender import cutout, silhouette, upright
 from scene_ir.derender.cutout import CROP_HW, HALO, TILE, CutoutNet
 from scene_ir.derender.pose import crop_boxes
 from scene_ir.derender.silhouette import Placement
@@ -61,6 +62,9 @@ LAYERS = ("red", "green", "blue", "visible", "front", "shadow", "nearer", "whole
 or another's shadow on the ground; nearer vehicles; and the share that would show it if nothing hid it."""
 _GROUND = (int(Semantic.ROAD), int(Semantic.TERRAIN))
 VEHICLES = ("Car", "Van", "Truck")
+PEOPLE = ("Pedestrian", "Cyclist")
+CROWD = 8
+"""Times as many people in the streets that people are learnt from."""
 
 
 @dataclass(frozen=True)
@@ -83,20 +87,22 @@ class CutoutCases:
     size_lhw: np.ndarray
     """The true pose, (K, 3)."""
     kind: np.ndarray
-    """Index into `VEHICLES`, (K,)."""
+    """Index into `VEHICLES`, or into `PEOPLE`, (K,)."""
     visible: np.ndarray
     """Share of its silhouette in the image, (K,)."""
 
 
-def street_settings(index: int, split: str, pack: Assets) -> SynthSettings:
-    """Every other street with the pack's vehicles and skies, all with more vehicles than KITTI has."""
+def street_settings(index: int, split: str, pack: Assets, people: bool = False) -> SynthSettings:
+    """Every other street with the pack's vehicles and skies, all with more vehicles, or people, than KITTI has."""
     fleet = of_split(pack.vehicles, split) if index % 2 else ()
-    layout = LayoutSettings(variants=VARIANTS[split], vehicles=(4, 12), fleet=fleet)
+    layout = LayoutSettings(variants=VARIANTS[split], vehicles=(4, 12), fleet=fleet, crowd=CROWD if people else 1)
     return SynthSettings(layout, bent=True, skies=pack.skies if index % 2 else ())
 
 
-def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]:
-    """Yield crop (h, w, 8) and row of `CutoutCases`, without start, of each usable vehicle of a frame."""
+def cutout_cases(
+    frame: SynthFrame, labels: tuple[str, ...] = VEHICLES
+) -> Iterator[tuple[Bytes, dict[str, object]]]:
+    """Yield crop (h, w, 8) and row of `CutoutCases`, without start, of each usable object of a frame."""
     assert frame.background is not None
     samples = blocks(frame.owner)
     lit = frame.background.max(-1).astype(np.float32)
@@ -106,7 +112,7 @@ def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]
     for truth in frame.truths:
         height = truth.box_xyxy[3] - truth.box_xyxy[1]
         if (
-            truth.actor.label not in VEHICLES
+            truth.actor.label not in labels
             or not LEAST_PX <= height <= MOST_PX
             or truth.visible < LEAST_SEEN
             or not np.isfinite(nearest_m(truth, frame))
@@ -126,7 +132,7 @@ def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]
         for other in frame.truths:
             if other is not truth and np.count_nonzero((whole > 0.5) & (shares[other.index] > 0.5)) >= 2:
                 hiding += shares[other.index]
-            if other.actor.label in VEHICLES and far_m(other) < far_m(truth):
+            if other.actor.label in {*VEHICLES, *labels} and far_m(other) < far_m(truth):
                 nearer += shares[other.index]
         near = (frame.depth_m[window] < nearest_m(truth, frame) - CLEAR_M) & ~ground[window]
         # Beyond its own border a pixel's share is unknown: what hides part of it, may hide all.
@@ -144,7 +150,7 @@ def cutout_cases(frame: SynthFrame) -> Iterator[tuple[Bytes, dict[str, object]]]
                 "translation": truth.translation,
                 "yaw": truth.yaw,
                 "size_lhw": truth.actor.size_lhw,
-                "kind": VEHICLES.index(truth.actor.label),
+                "kind": labels.index(truth.actor.label),
                 "visible": truth.visible,
             },
         )
@@ -188,13 +194,19 @@ CHUNK = 40
 """Streets that are made, or not, together."""
 
 
-def make(folder: Path, split: str, seed: int, frames: int, assets: Path | None) -> list[Path]:
-    """Folders of `CHUNK` streets each, made where they are not there yet: all of `frames` streets' vehicles."""
+def make(
+    folder: Path, split: str, seed: int, frames: int, assets: Path | None, people: bool = False
+) -> list[Path]:
+    """Folders of `CHUNK` streets each, made where they are not there yet: all of `frames` streets' vehicles, or
+    people.
+    """
+    labels = PEOPLE if people else VEHICLES
     pack = assets_from(assets) if assets is not None else Assets((), ())
     made = []
     for first in range(0, frames, CHUNK):
         part = folder / f"{first:05d}"
         facts = {"seed": seed, "split": split, "assets": assets is not None, "generator": GENERATOR_VERSION}
+        facts |= {"people": True} if people else {}
         facts["frames"] = min(CHUNK, frames - first)
         made.append(part)
         if (part / "made.json").is_file() and files.read_json(part / "made.json") == facts:
@@ -204,9 +216,10 @@ def make(folder: Path, split: str, seed: int, frames: int, assets: Path | None) 
         place = 0
         with (part / "layers.bin").open("wb") as out:
             for index in range(first, first + facts["frames"]):
-                frame = render_frame(plan_frame(seed, index, split, street_settings(index, split, pack)), True)
+                settings = street_settings(index, split, pack, people)
+                frame = render_frame(plan_frame(seed, index, split, settings), True)
                 assert frame is not None
-                for crop, row in cutout_cases(frame):
+                for crop, row in cutout_cases(frame, labels):
                     out.write(crop.tobytes())
                     rows.append(row | {"start": place})
                     place += crop.size
@@ -214,14 +227,15 @@ def make(folder: Path, split: str, seed: int, frames: int, assets: Path | None) 
             part / "cases.npz", {f.name: np.array([row[f.name] for row in rows]) for f in fields(CutoutCases)}
         )
         files.write_json(part / "made.json", facts)
-        print(f"{split}: {first + facts['frames']} streets, {len(rows)} vehicles in the last {CHUNK}", flush=True)
+        print(f"{split}: {first + facts['frames']} streets, {len(rows)} objects in the last {CHUNK}", flush=True)
     return made
 
 
 class CutoutStore:
     """Vehicles of folders that `make` wrote."""
 
-    def __init__(self, parts: Sequence[Path]) -> None:
+    def __init__(self, parts: Sequence[Path], people: bool = False) -> None:
+        self.people = people
         loaded = [files.read_npz(part / "cases.npz") for part in parts]
         self.cases = CutoutCases(*(np.concatenate([one[f.name] for one in loaded]) for f in fields(CutoutCases)))
         self.part = np.repeat(np.arange(len(parts)), [len(one["start"]) for one in loaded])
@@ -244,8 +258,17 @@ class CutoutStore:
         return Camera(matrix[:, :3].contiguous(), height, width, matrix)
 
     def disturbed(self, index: int, amount: float, rng: np.random.Generator) -> Placement:
-        """A template at the vehicle's label, off by `amount` times what hand-drawn labels are."""
+        """A template at the vehicle's label, or a person's box, off by `amount` times what hand-drawn labels are."""
         cases = self.cases
+        if self.people:
+            x0, y0, _, _ = cases.rect[index].tolist()
+            whole = self.layers(index)[..., 7] > 127
+            rows, columns = np.flatnonzero(whole.any(1)), np.flatnonzero(whole.any(0))
+            box = np.array([x0 + columns[0], y0 + rows[0], x0 + columns[-1], y0 + rows[-1]], np.float64)
+            side = np.tile(box[2:] - box[:2], 2)
+            box += amount * (BOX_SHARE * side + 0.5) * np.clip(rng.normal(0, 0.8, 4), -1.5, 1.5)
+            place = torch.from_numpy(cases.translation[index]).float()
+            return upright.place_box(torch.from_numpy(box), place, self.camera(index))
         angle, far = rng.uniform(0, 2 * math.pi), amount * SHIFT_M * min(abs(rng.normal(0, 0.8)), 1.5)
         place = cases.translation[index].copy()
         normal = cases.ground[index]
@@ -263,8 +286,8 @@ class CutoutStore:
         )
 
 
-SHIFT_M, TURN_RAD, STRETCH = 0.2, math.radians(5.0), 0.05
-"""How far labels are off: as hand-drawn 3D boxes are."""
+SHIFT_M, TURN_RAD, STRETCH, BOX_SHARE = 0.2, math.radians(5.0), 0.05, 0.04
+"""How far labels are off: as hand-drawn 3D boxes are, and the sides of people's 2D boxes, in its sides."""
 AMOUNTS, AMOUNT_SHARE = (0.2, 1.0, 2.0), (0.45, 0.35, 0.2)
 """Of that: as after the fit, as labels, and worse."""
 WRONG_SHARE, LIKELIEST_SHARE = 0.08, 0.6
@@ -272,6 +295,8 @@ WRONG_SHARE, LIKELIEST_SHARE = 0.08, 0.6
 CAMOUFLAGE_SHARE, JPEG_SHARE, POLE_SHARE, GIVEN_SHARE = 0.3, 0.3, 0.15, 0.3
 """Vehicles painted as bright as what is around them; photographs that were compressed; vehicles with a pole in
 front; refinements start from a mask instead of a first pass."""
+CLOTHES_SHARE = 0.7
+"""People whose clothes get folds and patterns."""
 TILES = 2
 """Refinement tiles per vehicle."""
 
@@ -314,6 +339,8 @@ def make_sample(
     photograph = np.ascontiguousarray(layers[..., :3])
     shares, nearer = np.ascontiguousarray(layers[..., 3:6]), np.ascontiguousarray(layers[..., 6])
     if rng is not None:
+        if store.people and rng.random() < CLOTHES_SHARE:
+            photograph = vary_clothes(photograph, shares[..., 0], rng)
         photograph, shares = vary_appearance(photograph, shares, rng)
     box = np.array([[rect[0] - left, rect[1] - top, rect[2] - left, rect[3] - top]], np.float32) - 0.5
     inside = cutout.inside_mask(rect, (left, top, right, bottom))
@@ -380,6 +407,19 @@ def vary_appearance(photograph: Bytes, shares: Bytes, rng: np.random.Generator) 
         _, data = cv2.imencode(".jpg", photograph, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(30, 95))])
         photograph = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
     return photograph, shares
+
+
+def vary_clothes(photograph: Bytes, visible: Bytes, rng: np.random.Generator) -> Bytes:
+    """A person in clothes with folds and patterns: smooth factors of all sizes on what is visible (h, w)."""
+    h, w = visible.shape
+    folds = np.zeros((h, w, 3), np.float32)
+    for cells in (2, 5, 12):
+        coarse = rng.normal(0, rng.uniform(0, 0.4), (cells * 2, cells, 1)) + rng.normal(
+            0, 0.1, (cells * 2, cells, 3)
+        )
+        folds += cv2.resize(coarse.astype(np.float32), (w, h), interpolation=cv2.INTER_CUBIC)
+    alpha = visible.astype(np.float32)[..., None] / 255
+    return np.clip(photograph * (1 + alpha * (np.exp(folds) - 1)), 0, 255).astype(np.uint8)
 
 
 def camouflage(photograph: Bytes, visible: Bytes, rng: np.random.Generator) -> Bytes:
@@ -608,24 +648,23 @@ def judge(store: CutoutStore, network: CutoutNet, amount: float, most: int = 200
     }
 
 
-CARD = """# Vehicles cut out of photographs, trained on generated streets
+CARD = """# {title} cut out of photographs, trained on generated streets
 
 - Architecture: `scene_ir.derender.cutout.CutoutNet`, {parameters:,} parameters: an encoder to a sixteenth and back
-  on a 96x160 crop around the placed template (colours, the template's coverage and surface, nearness to its
-  footprint, nearer vehicles), and {second:,} for a refinement at the photograph's own pixels along the borders.
-- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. Nothing pretrained.
+  on a 96x160 crop around {guide} (colours, its coverage and surface, nearness to its
+  footprint, nearer objects), and {second:,} for a refinement at the photograph's own pixels along the borders.
+- Weights: `{file}`, float16, safetensors. Licence: Apache-2.0, as the whole project. {start}
+  SHA-256: `{sha256}`
 - Data: {frames:,} streets of the project's own generator (version {version}, split train, seed {data_seed}),
-  {vehicles:,} vehicles at least {least:.0f} px high of which 10% show; no photographs. Every other street has
-  vehicles and skies of the pack that `tools/fetch_assets.py` fetches. Templates at labels that are off as after
-  the fit, as drawn by hand, and by twice that; some of a wrong kind. Other light and colours, blur, noise,
-  compression; vehicles painted as bright as what is around them; poles in front.
+  {vehicles:,} objects at least {least:.0f} px high of which 10% show; no photographs. {variety}
+  Other light and colours, blur, noise, compression; objects as bright as what is around them; poles in front.
 - Training: {steps:,} steps of {batch}, in {count} cycles of the rate, {minutes:.0f} minutes of one CPU core,
   seed {seed}.{note}
 
 ## Figures
 
-Held out: {held} vehicles of the generator's split heldout (shapes and streets that no training street has), seed
-{held_seed}. Labels are off by `amount` times 0.2 m, 5 degrees and 5%. "large": at least 40 px high, of which 70%
+Held out: {held} objects of the generator's split heldout (shapes and streets that no training street has), seed
+{held_seed}. Labels are off by `amount` times {off}. "large": at least 40 px high, of which 70%
 show; "others": smaller or more hidden. IoU of the pixels at least half covered; border: mean error of the shares
 across the true border, in px.
 
@@ -633,18 +672,41 @@ across the true border, in px.
 
 ## Limits
 
-It has seen generated pictures only. Without a template near its place it finds nothing: it is no detector. On
-photographs it takes dark parts of vehicles for occluders now and then, and misses thin poles and trunks;
-`believed` keeps of the former only what is shaped like a pole or known from elsewhere. Not for use in a vehicle.
+It has seen generated pictures only. Without {guide} it finds nothing: it is no detector.
+{limits} Not for use in a vehicle.
 
 ## Train it again
 
 ```
 python tools/fetch_assets.py build/assets
-python tools/train_cutout.py --assets build/assets --frames {frames} --steps {cycles} --seed {seed}
+python tools/train_cutout.py {option} --frames {frames} --steps {cycles} --seed {seed}
 ```
 With the same, on the same machine, another run gives the same bytes.
 """
+VEHICLE_CARD = {
+    "title": "Vehicles",
+    "guide": "the placed template",
+    "start": "Nothing pretrained.",
+    "variety": """Every other street has
+  vehicles and skies of the pack that `tools/fetch_assets.py` fetches. Templates at labels that are off as after
+  the fit, as drawn by hand, and by twice that; some of a wrong kind.""",
+    "off": "0.2 m, 5 degrees and 5%",
+    "limits": """On
+photographs it takes dark parts of vehicles for occluders now and then, and misses thin poles and trunks;
+`remove_unlikely_occluders` keeps of the former only what is shaped like a pole or known from elsewhere.""",
+    "option": "--assets build/assets",
+}
+PEOPLE_CARD = {
+    "title": "People and cyclists",
+    "guide": "a thin upright box that fills the label's 2D box",
+    "start": "Trained on from `cutout.safetensors`.",
+    "variety": """Boxes
+  with sides that are off as drawn by hand, more, and less. Clothes with folds and patterns.""",
+    "off": "4% of the box's sides",
+    "limits": """On photographs it is unsure of very bright clothes, bags, and people under 40 px high, and it leaves
+out what people carry and push; `scene_ir.derender.people` uses no outline that it is unsure of.""",
+    "option": "--people --out scene_ir/derender/weights/people.safetensors",
+}
 COLUMNS = (
     *(("vehicles", "large", "{:.0f}"), ("iou", "IoU", "{:.3f}"), ("iou_p10", "IoU, 10%", "{:.3f}")),
     *(("others", "others", "{:.0f}"), ("others_iou", "IoU", "{:.3f}"), ("others_iou_p10", "IoU, 10%", "{:.3f}")),
@@ -663,6 +725,9 @@ def format_table(metrics: dict[float, dict[str, float]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--assets", type=Path, help="pack of vehicles and skies; without it only the templates'")
+    parser.add_argument(
+        "--people", action="store_true", help="learn people and cyclists, from the vehicles' weights"
+    )
     parser.add_argument("--run", type=Path, default=Path("build/cutout"), help="streets, checkpoint, log")
     parser.add_argument("--out", type=Path, default=cutout.WEIGHTS)
     parser.add_argument("--frames", type=int, default=240, help="streets to train on")
@@ -680,10 +745,16 @@ def main() -> None:
     rates = [rate for _, rate in CutoutSettings.cycles]
     cycles = tuple((steps, rates[min(i, len(rates) - 1)]) for i, steps in enumerate(arguments.steps))
     settings = CutoutSettings(cycles, arguments.batch, seed=arguments.seed)
-    seeds = arguments.data_seed, arguments.data_seed + 1
-    store = CutoutStore(make(arguments.run / "train", "train", seeds[0], arguments.frames, arguments.assets))
-    held = CutoutStore(make(arguments.run / "heldout", "heldout", seeds[1], arguments.held_out, arguments.assets))
+    seeds, people = (arguments.data_seed, arguments.data_seed + 1), arguments.people
+    store, held = (
+        CutoutStore(make(arguments.run / split, split, seed, frames, arguments.assets, people), people)
+        for split, seed, frames in zip(
+            ("train", "heldout"), seeds, (arguments.frames, arguments.held_out), strict=True
+        )
+    )
     run = CutoutRun(settings)
+    if people:
+        run.network.load_state_dict(cutout.load_network().state_dict())
     checkpoint = arguments.run / "checkpoint.safetensors"
     if checkpoint.is_file():
         run.load(checkpoint)
@@ -722,6 +793,8 @@ def main() -> None:
         note=f"\n  {arguments.remark}" if arguments.remark else "",
         held=len(held),
         table=format_table(metrics),
+        sha256=files.sha256_digest(arguments.out),
+        **(PEOPLE_CARD if people else VEHICLE_CARD),
     )
     files.write_text(arguments.out.with_suffix(".md"), card)
 

@@ -60,7 +60,13 @@ _UNASSIGNED = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 _names = iter(COCO_CLASSES)
 COCO_CLASSES_91 = tuple(NO_CLASS if number in _UNASSIGNED else next(_names) for number in range(91))
 """By the numbers in COCO's files, which torchvision uses: 0 is the background, ten were never assigned."""
-CLASS_LISTS: dict[str, tuple[str, ...]] = {"coco": COCO_CLASSES, "coco91": COCO_CLASSES_91}
+COCO_PEOPLE = tuple("Pedestrian" if name == "person" else name for name in COCO_CLASSES)
+"""COCO's 80 classes with people as pedestrians; riders are among them."""
+CLASS_LISTS: dict[str, tuple[str, ...]] = {
+    "coco": COCO_CLASSES,
+    "coco91": COCO_CLASSES_91,
+    "coco-people": COCO_PEOPLE,
+}
 """Lists that the setting `classes` may name."""
 
 

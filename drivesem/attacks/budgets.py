@@ -45,6 +45,7 @@ PRESETS: Mapping[str, Budget] = {
         across_m=1.0,
         distance_share=0.3,
         partly_visible=0.25,
+        walk_m=2.0,
         size=0.1,
         sun=1.0,
         night=1.0,
@@ -153,4 +154,6 @@ def _narrow_budget(where: str, content: Any, preset: Budget = PRESETS[PAPER]) ->
             maximum = "" if widest == math.inf else f" of at most {widest:g}"
             raise FormatError(f"{where}: {name}", f"a positive number{maximum}", value)
         limits[key] = limit
+        if key == Parameter.TRANSLATE:
+            limits["walk_m"] = 0.0  # own lengths limit people too
     return replace(preset, **limits)

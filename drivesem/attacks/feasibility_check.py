@@ -61,6 +61,13 @@ MINIMUM_PX = 8.0
 MINIMUM_TOLERANCE_PX = 1.0
 WEATHER_TOLERANCE = 0.01
 """Tolerance of weather codes and their limits."""
+PEOPLE = (2, 3)
+"""Categories of people and cyclists."""
+PEOPLE_TURN, PEOPLE_GROWTH, PEOPLE_COLOR = math.radians(5), 0.05, np.array([0.5, 0.5, 0.5, 0.0, 0.0])
+"""rad, share of their size, and codes of their clothes, by which people may change; they do not bend, and have no
+lamps."""
+LEVEL_SHARE = 0.18
+"""Difference of the background's depth from the ground plane's, as a share, up to which a person can stand there."""
 _NIGHT, _SNOW = 4, 5
 """Indices of the codes of night and snow."""
 RAIN_UNDER_CLEAR_SKY = 0.5
@@ -116,6 +123,8 @@ class ChangeLimits:
     """Code of snow."""
     lamps: float = 0.0
     """Code, absolute."""
+    walk_m: float = 0.0
+    """m, along and across, of people and cyclists in place of `translate` and `across_m`; 0: as for cars."""
     roi: bool = False
     """Whether `translate` uses the parametrisation of 3D-SDN."""
 
@@ -251,6 +260,9 @@ class _MeasuredPose:
         self.yaw = float(objects.yaw[i])
         self.size = objects.size_lhw[i].detach().double().numpy()
         self.lattice = objects.ffd[i].detach().double().numpy().reshape(4, 4, 4, 3)
+        self.person = int(objects.category[i]) in PEOPLE
+        self.lamps = float(objects.lamps[i])
+        self.colour = objects.texture_code[i].detach().double().numpy()
         self.whole = int(objects.occlusion[i]) == 0 and float(objects.truncation[i]) <= MAX_CUT
         forward = np.array([math.cos(self.yaw), 0.0, -math.sin(self.yaw)])
         sideways = np.array([math.sin(self.yaw), 0.0, math.cos(self.yaw)])
@@ -472,7 +484,11 @@ def _move_violations(old: _MeasuredPose, new: _MeasuredPose, limits: ChangeLimit
     along, across = metres[0] / old.size[0], metres[2] / old.size[0]
     most_m = min(limits.translate_m, limits.distance_share * math.hypot(*old.position))
     across_m = min(most_m, limits.across_m)
-    most = limits.translate if old.whole else min(limits.translate, limits.partly_visible)
+    most = limits.translate
+    if old.person and limits.walk_m:
+        most_m = across_m = min(most_m, limits.walk_m)
+        most = math.inf
+    most = most if old.whole else min(most, limits.partly_visible)
     if max(abs(along), abs(across)) > most + LIMIT_TOLERANCE:
         violations.append(f"moved by {along:.3f}, {across:.3f} own lengths")
     elif abs(metres[0]) > most_m + LIMIT_TOLERANCE or abs(metres[2]) > across_m + LIMIT_TOLERANCE:
@@ -484,16 +500,21 @@ def _shape_violations(old: _MeasuredPose, new: _MeasuredPose, limits: ChangeLimi
     """Rotation, lattice offsets and size of a car beyond the limits."""
     violations = []
     turned = math.remainder(new.yaw - old.yaw, 2 * math.pi)
-    if abs(turned) > limits.rotate + LIMIT_TOLERANCE:
+    if abs(turned) > (min(limits.rotate, PEOPLE_TURN) if old.person else limits.rotate) + LIMIT_TOLERANCE:
         violations.append(f"turned by {turned:.3f} rad")
     bent = float(np.abs(new.lattice - old.lattice).max())
-    if bent > limits.mesh + LIMIT_TOLERANCE:
+    if bent > (0.0 if old.person else limits.mesh) + LIMIT_TOLERANCE:
         violations.append(f"lattice bent by {bent:.3f} unit boxes")
     grown = new.size / old.size - 1
-    if np.abs(grown).max() > (limits.size + LIMIT_TOLERANCE if limits.size and old.whole else 0.0):
+    growth = min(limits.size, PEOPLE_GROWTH) if old.person else limits.size
+    if np.abs(grown).max() > (growth + LIMIT_TOLERANCE if limits.size and old.whole else 0.0):
         violations.append(f"size changed by {100 * grown[np.abs(grown).argmax()]:.1f} %")
     elif np.ptp(grown) > LIMIT_TOLERANCE:
         violations.append("size changed, and not alike in length, height and width")
+    if old.person and new.lamps != old.lamps:
+        violations.append("lamps of a person")
+    if old.person and (np.abs(new.colour) > np.maximum(PEOPLE_COLOR, np.abs(old.colour)) + LIMIT_TOLERANCE).any():
+        violations.append(f"clothes recoloured by {np.abs(new.colour).max():.2f}")
     return violations
 
 
@@ -539,15 +560,33 @@ def _mesh_violations(old: _MeasuredCar, new: _MeasuredCar) -> list[str]:
 
 
 def _road_violations(base: SceneIR, road: Array, old: _MeasuredCar, new: _MeasuredCar) -> list[str]:
+    if old.person and (_road_share(base, road, old, at_feet=True) or 0.0) < 0.5:
+        green = base.environment.foliage_map.numpy().astype(np.float64)
+        on_grass = (_road_share(base, green, old, at_feet=True) or 0.0) >= 0.5
+        sure = ((road - 0.5) / 0.3).clip(0, 1)
+        road = _level_ground(base) * (1 - sure) * (1.0 if on_grass else 1 - green)
     before, after = (_road_share(base, road, car) for car in (old, new))
     if before is None or after is None or after >= before - ROAD_LOSS - ROAD_TOLERANCE:
         return []
     return [f"left the road, {after:.2f} of its footprint on it ({before:.2f} before)"]
 
 
-def _road_share(base: SceneIR, road: Array, car: _MeasuredCar) -> float | None:
-    """Mean of the road map over a fine grid on the footprint; None if most of it is outside of the picture."""
-    a, b = car.low, car.high
+def _level_ground(base: SceneIR) -> Array:
+    """Pixels (H, W), 0 or 1, with a background as far away as the ground plane."""
+    matrix, plane = base.camera.matrix.double().numpy(), base.environment.ground.double().numpy()
+    inverse = np.linalg.inv(matrix[:, :3])
+    y, x = np.mgrid[0 : base.camera.height, 0 : base.camera.width]
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ inverse.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ground_m = (plane[:3] @ inverse @ matrix[:, 3] - plane[3]) / (rays @ plane[:3])
+        return (np.abs(base.depth.double().numpy() / ground_m - 1) < LEVEL_SHARE).astype(np.float64)
+
+
+def _road_share(base: SceneIR, road: Array, car: _MeasuredCar, at_feet: bool = False) -> float | None:
+    """Mean of the road map over a fine grid on the footprint, or only at the label's place; None if most of it is
+    outside of the picture.
+    """
+    a, b = (np.zeros(3), np.zeros(3)) if at_feet else (car.low, car.high)
     x, z = np.meshgrid(np.linspace(a[0], b[0], 33), np.linspace(a[2], b[2], 17), indexing="ij")
     local = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=-1)
     points = local @ car.axes + car.position

@@ -190,6 +190,17 @@ _MAX_TRUNCATION = 0.1
 """Truncation up to which moved vehicles were compared with the truth (`python -m tools.bench moves`)."""
 
 
+_UPRIGHT_LIMITS: dict[Parameter, float | tuple[float, ...]] = {
+    Parameter.COLOR: (0.5, 0.5, 0.5, 0.0, 0.0),
+    Parameter.ROTATE: math.radians(5),
+    Parameter.MESH: 0.0,
+    Parameter.SIZE: 0.05,
+    Parameter.LAMPS: 0.0,
+}
+"""Limits of people and cyclists besides the budget's: a surface that faces the camera hardly turns, and has no limbs
+to move; beyond half of the code, clothes lose their folds and patterns, and gloss and dirt are those of paint."""
+
+
 @dataclass(frozen=True, slots=True)
 class Budget:
     """Limits of the change. Codes are bounded in value, regardless of the start; other limits are distances from
@@ -227,10 +238,14 @@ class Budget:
     """Share of the vehicle's distance from the camera."""
     partly_visible: float = math.inf
     """Own lengths, for vehicles that are not `fully_visible` in the photograph."""
+    walk_m: float = 0.0
+    """Metres, along and across, for people and cyclists instead of own lengths and `across_m`; 0: as for vehicles."""
 
     def __post_init__(self) -> None:
         unbounded = ("translate_m", "across_m", "distance_share", "partly_visible")
-        _check_positive("budget", self, unbounded, zero_allowed=("size", "sun", "night", "snow", "lamps"))
+        _check_positive(
+            "budget", self, unbounded, zero_allowed=("size", "sun", "night", "snow", "lamps", "walk_m")
+        )
 
     def check(self, params: Iterable[Parameter], parametrisation: Parametrisation = "ground") -> None:
         """Raise FormatError for a parameter that this budget fixes, or for a budget in metres with `roi`."""
@@ -384,8 +399,12 @@ class ParameterSpace(ThetaSpace[Parameter]):
             self.upper[where] = high
             self.step[where] = getattr(self.steps, parameter.value)
             if specs[parameter].per_object:
+                most = self.upper.new_tensor(_UPRIGHT_LIMITS.get(parameter, math.inf))
+                upright = scene.objects.upright
                 for bound in (self.lower, self.upper):
-                    bound[where].view(self.count, specs[parameter].size)[behind_camera(scene)] = 0
+                    block = bound[where].view(self.count, specs[parameter].size)
+                    block[behind_camera(scene)] = 0
+                    block[upright] = block[upright].clamp(-most, most)
 
     def unflatten(self, theta: Tensor) -> Perturbation:
         """theta (D,) as named tensors (views of it). Raises ShapeError."""
@@ -511,8 +530,11 @@ class ParameterSpace(ThetaSpace[Parameter]):
             budget, objects = self.budget, self.scene.objects
             length_m, place = objects.size_lhw[:, :1].detach(), objects.translation.detach()
             limit_m = length_m.new_tensor([budget.translate_m, min(budget.translate_m, budget.across_m)])
+            walks = objects.upright[:, None] & (budget.walk_m > 0)
+            limit_m = torch.where(walks, min(budget.walk_m, budget.translate_m), limit_m)
             limit_m = torch.minimum(limit_m, budget.distance_share * place.norm(dim=1, keepdim=True))
-            reach = (limit_m / length_m).clamp(max=limit)
+            reach = limit_m / length_m
+            reach = torch.where(walks, reach, reach.clamp(max=limit))
             hidden = ~fully_visible(self.scene)
             reach[hidden] = reach[hidden].clamp(max=budget.partly_visible)
             return -reach.reshape(-1), reach.reshape(-1)

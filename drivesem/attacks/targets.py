@@ -156,6 +156,11 @@ class TargetSelection:
             return tuple(name for name in names if name in self.classes)
         return tuple(names) if self.objects is None else ()
 
+    def headline(self, names: Sequence[str]) -> str:
+        """The class among `names` with the first results: HEADLINE, unless it is not targeted."""
+        targeted = self.classes_of(names) if self.classes is not None else ()
+        return HEADLINE if HEADLINE in targeted or not targeted else targeted[0]
+
     def _targeted(self, targets: Targets) -> Tensor:
         """(M,) bool: which targets are targeted."""
         targeted = torch.ones(len(targets), dtype=torch.bool, device=targets.labels.device)

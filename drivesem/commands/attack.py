@@ -49,8 +49,8 @@ def _print(summary: RunSummary, console: Console) -> None:
     lost = summary.lost_by_grade
     lines = (
         f"{describe_frames(summary)}; {describe_objects(summary)}",
-        f"missed before the attack: {summary.missed_before.format('judged vehicles')}",
-        f"lost by threshold: {lost[Grade.THRESHOLD].format('vehicles found before')}; certainly lost: "
+        f"missed before the attack: {summary.missed_before.format(f'judged {summary.noun}s')}",
+        f"lost by threshold: {lost[Grade.THRESHOLD].format(f'{summary.noun}s found before')}; certainly lost: "
         f"{lost[Grade.CERTAIN].format()}; {format_count(sum(summary.phantoms.values()), 'phantom')} by threshold",
         f"frames broken by threshold: {summary.broken.format('attacked frames')}; feasible {feasible}; "
         f"{format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s",
@@ -62,7 +62,7 @@ def _print(summary: RunSummary, console: Console) -> None:
     for note, frames in summary.grade_notes.items():
         console.print(f"{format_count(frames, 'frame')}: {note}", soft_wrap=True)
     if summary.frames_without_vehicles:
-        console.print(f"{format_count(summary.frames_without_vehicles, 'frame')} without vehicles skipped")
+        console.print(f"{format_count(summary.frames_without_vehicles, 'frame')} without {summary.noun}s skipped")
     for name, reason in summary.frames_failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     console.print(f"report: {Path(summary.out) / 'report.html'}", soft_wrap=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -119,11 +120,14 @@ def derender_command(config: DerenderConfig) -> int:
         print_json({"out": str(result.out), "frames": frames, **facts})
         return 0
     lines = Console()
+    noun = "object" if config.people else "vehicle"
     for name, summary in result.frames.items():
         duration = "already there" if summary.seconds is None else f"{summary.seconds:.1f} s"
-        lines.print(
-            f"{name}: {format_count(summary.objects, 'vehicle')}, {duration}", soft_wrap=True, highlight=False
-        )
+        lines.print(f"{name}: {format_count(summary.objects, noun)}, {duration}", soft_wrap=True, highlight=False)
+    reasons = Counter(reason for summary in result.frames.values() for reason in summary.left_out.values())
+    if reasons:
+        text = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        lines.print(f"people that stay background: {text}", soft_wrap=True, highlight=False)
     for name, reason in result.failed.items():
         console.print(f"frame {name} could not be used: {reason}", soft_wrap=True)
     lines.print(

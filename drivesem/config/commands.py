@@ -148,6 +148,11 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     part: Annotated[str | None, ParsedBy(parse_part)] = None
     """Part of the frames for one of several machines: K/N is every N-th, from the K-th (drivesem runs merge)."""
 
+    @property
+    def moves_people(self) -> bool:
+        named = (self.target_classes or "").split(",")
+        return self.people or any(name.strip() in ("Pedestrian", "Cyclist") for name in named)
+
     def check(self) -> None:
         super().check()
         method, gradient_free = self.method, self.method in GRADIENT_FREE_METHODS

@@ -247,6 +247,8 @@ class SceneOptions(FrameFilterOptions, DataSourceOptions):
 
     fit: bool = True
     """Fit template, pose and shape to the silhouettes in photographs."""
+    people: Flag = False
+    """Make objects of labelled pedestrians and cyclists too; --target-classes with one of them does it as well."""
     cache: str | None = None
     """Folder that stores de-rendered photographs for later runs."""
     cache_gb: Annotated[float, NumberRange(0, ends="()", expected="a number above 0")] = 4.0
@@ -255,6 +257,11 @@ class SceneOptions(FrameFilterOptions, DataSourceOptions):
     """Focal length of photographs without a camera, px (default: EXIF's, or 0.58 of the longer side)."""
     finder: str = DEFAULT_FINDER
     """Detector that finds vehicles in --dataset photographs."""
+
+    @property
+    def moves_people(self) -> bool:
+        """Whether people and cyclists become objects."""
+        return self.people
 
     def check(self) -> None:
         super().check()

@@ -31,6 +31,8 @@ IGNORED_TYPES: Mapping[str, str | None] = {
 A bicycle is ignored for cyclists, since a KITTI cyclist includes the rider."""
 VEHICLES = ("Car", "Van", "Truck")
 """Types that are de-rendered into movable objects."""
+PEOPLE = ("Pedestrian", "Cyclist")
+"""Types that are de-rendered into movable objects with --people."""
 
 _SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "Car": (
@@ -120,6 +122,7 @@ def select_road_users(labels: Labels) -> Labels:
     return labels if len(rows) == len(labels.kind) else labels.select(rows)
 
 
-def count_vehicles(labels: Labels | None) -> int:
-    """Count the movable objects of a frame."""
-    return 0 if labels is None else sum(object_type(kind) in VEHICLES for kind in labels.kind)
+def count_vehicles(labels: Labels | None, people: bool = False) -> int:
+    """Count the movable objects of a frame, with or without people."""
+    movable = VEHICLES + PEOPLE if people else VEHICLES
+    return 0 if labels is None else sum(object_type(kind) in movable for kind in labels.kind)

@@ -245,9 +245,11 @@ def _count_photographed_pixels(prepared: PreparedScene, rest: VisibleSurfaces) -
     bottom = mesh.y.new_zeros(count).scatter_reduce(0, mesh.owner[mesh.hit], mesh.y[mesh.hit], "amax")
     lower = is_free & (mesh.y >= (bottom - _LOWER_PART * (bottom - top + 1))[mesh.owner])
     lower_px = _sum_by_owner(mesh.owner, lower, count).clamp(min=1.0)
+    # The surface of a person is wider than the outline by design.
+    fitted = (~prepared.scene.objects.upright).to(both)
     return {
-        "mismatched": 1.0 - both / union.clamp(min=1.0),
-        "unsupported": _sum_by_owner(mesh.owner, lower & ~is_own, count) / lower_px,
+        "mismatched": fitted * (1.0 - both / union.clamp(min=1.0)),
+        "unsupported": fitted * _sum_by_owner(mesh.owner, lower & ~is_own, count) / lower_px,
     }
 
 

@@ -33,7 +33,7 @@ from drivesem.attacks.methods.margin_search import (
 from drivesem.attacks.methods.scw import SCW
 from drivesem.attacks.objective import GRADIENT_FREE_TERMS, Objective
 from drivesem.attacks.space import Parameter, parse_params
-from drivesem.attacks.targets import HEADLINE, EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.attacks.targets import EvaluatedClasses, TargetSelection, resolve_t_star
 from drivesem.config.commands import DEFAULT_QUERIES, GRADIENT_FREE_METHODS, AttackConfig
 from drivesem.config.constraints import parse_part
 from drivesem.config.devices import check_device
@@ -193,7 +193,8 @@ def _check_any_frame(
     reasons = [f"{format_count(without_vehicles, 'frame')} without"] if without_vehicles else []
     if failed:
         reasons.append(f"{len(failed)} that cannot be used, such as {next(iter(failed.items()))[1]}")
-    expected = "frames with cars, vans or trucks to attack (drivesem derender --sheet draws what it makes of one)"
+    kinds = "cars, vans, trucks or people" if config.moves_people else "cars, vans or trucks"
+    expected = f"frames with {kinds} to attack (drivesem derender --sheet draws what it makes of one)"
     source = f"--root {config.root}" if config.root else "--dataset"
     raise UsageError(source, expected, "; ".join(reasons) or "no frame")
 
@@ -650,18 +651,19 @@ def summarise_run(
         detector: the attacked detector.
         results: of all frames.
     """
-    t_star = resolve_t_star(detector, config.t_star)
+    t_star, classes = resolve_t_star(detector, config.t_star), EvaluatedClasses.from_detector(detector)
+    headline = TargetSelection.from_options(config.target_objects, config.target_classes).headline(classes.names)
     return RunSummary(
         out="",
         dataset=config.dataset,
         params=tuple(str(p) for p in params),
         detector=config.detector,
-        headline=HEADLINE,
+        headline=headline,
         t_star=t_star,
         frames_without_vehicles=0,
         frames_failed={},
         seconds=0.0,
-        **summarise_frames(results, EvaluatedClasses.from_detector(detector), t_star, HEADLINE),
+        **summarise_frames(results, classes, t_star, headline),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -24,9 +24,11 @@ class DerenderSummary:
     """One de-rendered frame."""
 
     objects: int
-    """Number of vehicles in its scene."""
+    """Number of objects in its scene."""
     seconds: float | None
     """Time to de-render and write it; None for frames of an earlier run."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """With people: why some stay in the background, by label."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,8 @@ class FrameDerenderer:
             seconds = round(time.perf_counter() - start, 3)
         if self.config.sheet and not (folder / SHEET).is_file():
             write_scene_sheet(folder / SHEET, scene, identifier)
-        return DerenderSummary(len(scene.objects), seconds)
+        left_out = {key: reason for key, reason in scene.provenance.items() if key.endswith(".background")}
+        return DerenderSummary(len(scene.objects), seconds, left_out)
 
 
 def derender_frames(config: DerenderConfig, on_source: Callable[[SceneSource], None]) -> DerenderRunResult:

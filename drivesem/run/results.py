@@ -182,9 +182,9 @@ class FrameResult:
     def reason_not_attacked(self) -> str:
         """Why the frame was not attacked."""
         if self.judged:
-            return f"none of {format_count(len(self.judged), 'judged vehicle')} is found before"
+            return f"none of {format_count(len(self.judged), 'judged object')} is found before"
         reason = "under 25 px high, hidden, cut off, faint, not targeted, or of a class that the detector lacks"
-        return f"none of {format_count(self.objects, 'vehicle')} is judged: {reason}"
+        return f"none of {format_count(self.objects, 'object')} is judged: {reason}"
 
     @property
     def graded(self) -> bool:
@@ -272,6 +272,11 @@ class RunSummary:
     """Files and label rows of the data set, and what became of them; empty for generated scenes."""
     map: FailureMap = dataclasses.field(default_factory=FailureMap)
     """Which features were searched, what fails there, and what is known to hold."""
+
+    @property
+    def noun(self) -> str:
+        """What the objects are called: vehicles, unless the headline's class is people's."""
+        return "vehicle" if self.headline in ("Car", "Truck") else "object"
 
     @property
     def frames_attacked(self) -> int:

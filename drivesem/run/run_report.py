@@ -336,11 +336,12 @@ def describe_next_step(config: AttackConfig, summary: RunSummary) -> str:
     """
     out, objects = shlex.quote(summary.out), summary.objects
     if not summary.frames_attacked:
-        more = "a detector that finds them, lower --t-star" if objects.judged else "frames with closer vehicles"
+        closer = f"frames with closer {summary.noun}s"
+        more = "a detector that finds them, lower --t-star" if objects.judged else closer
         frames = "other frames" if config.limit is None else f"more frames than --limit {config.limit}"
         found = f"{objects.judged} judged, {objects.found_before} found by {summary.detector}"
         return (
-            f"nothing to attack: {found}, of {format_count(objects.all, 'vehicle')} ({_first_reason(summary)}); "
+            f"nothing to attack: {found}, of {format_count(objects.all, summary.noun)} ({_first_reason(summary)}); "
             f"next: {more}, or {frames}"
         )
     if summary.grades[Grade.CERTAIN]:

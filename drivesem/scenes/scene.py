@@ -252,6 +252,7 @@ def derender(
     fit: bool = True,
     meshes: str | Path | None = None,
     segmenter: str | Path | None = None,
+    people: bool = False,
 ) -> Scene:
     """De-render a photograph into a scene.
 
@@ -267,6 +268,7 @@ def derender(
         fit: Fit vehicles to their outlines.
         meshes: Folder of additional meshes.
         segmenter: ONNX file of a segmentation network.
+        people: Make objects of people and cyclists too.
 
     Raises:
         UsageError: Names the argument.
@@ -277,7 +279,7 @@ def derender(
 
     if meshes is not None and not Path(meshes).is_dir():
         raise UsageError("meshes", "a folder", meshes)
-    settings = derender_settings(fit, meshes, segmenter)
+    settings = derender_settings(fit, meshes, segmenter, people)
     if isinstance(photo, Frame):
         if labels is not None or calib is not None or focal is not None:
             raise UsageError("labels, calib, focal", "none for a frame of a data set", "one")

@@ -43,7 +43,7 @@ class SceneSource(Protocol):
         ...
 
     def has_vehicles(self, identifier: str) -> bool:
-        """Whether the frame has a movable vehicle. Raises SceneError for a frame that cannot be read."""
+        """Whether the frame has a movable object. Raises SceneError for a frame that cannot be read."""
         ...
 
     def photograph(self, identifier: str) -> Tensor:
@@ -105,7 +105,7 @@ class DatasetSource:
     def has_vehicles(self, identifier: str) -> bool:
         from drivesem.data.classes import count_vehicles
 
-        return count_vehicles(self._dataset.labels(identifier)) > 0
+        return count_vehicles(self._dataset.labels(identifier), self._settings.people) > 0
 
     def photograph(self, identifier: str) -> Tensor:
         return self._dataset.frame(identifier).photograph
@@ -226,7 +226,7 @@ def place_vehicles(frame: Frame, settings: DerenderSettings) -> tuple[Frame, Der
     from drivesem.data.classes import count_vehicles
     from drivesem.scenes.label_free import FIT_TO_LABELS, estimate_label_poses, has_poses
 
-    if frame.labels is None or has_poses(frame.labels) or not count_vehicles(frame.labels):
+    if frame.labels is None or has_poses(frame.labels) or not count_vehicles(frame.labels, settings.people):
         return frame, settings
     return estimate_label_poses(frame), replace(settings, fitting=FIT_TO_LABELS)
 
@@ -250,7 +250,7 @@ def _load_finder(config: SceneOptions) -> Predictor:
 
 
 def derender_settings(
-    fit: bool, meshes: str | Path | None = None, segmenter: str | Path | None = None
+    fit: bool, meshes: str | Path | None = None, segmenter: str | Path | None = None, people: bool = False
 ) -> DerenderSettings:
     """Make the settings of de-rendering.
 
@@ -258,6 +258,7 @@ def derender_settings(
         fit: Fit vehicles to their outlines.
         meshes: Folder of additional meshes.
         segmenter: ONNX file of a segmentation network.
+        people: Make objects of people and cyclists too.
 
     Returns:
         The settings.
@@ -268,7 +269,7 @@ def derender_settings(
     from scene_ir.derender.derender import DerenderSettings
     from scene_ir.derender.silhouette import UserMesh
 
-    settings = DerenderSettings() if fit else DerenderSettings.fast()
+    settings = replace(DerenderSettings() if fit else DerenderSettings.fast(), people=people)
     if segmenter is not None:
         from drivesem.scenes.segmenter import OnnxSegmenter
 
@@ -284,8 +285,8 @@ def derender_settings(
 
 def _make_settings(config: SceneOptions) -> DerenderSettings:
     if isinstance(config, DerenderConfig):
-        return derender_settings(config.fit, config.meshes, config.segmenter)
-    return derender_settings(config.fit)
+        return derender_settings(config.fit, config.meshes, config.segmenter, config.people)
+    return derender_settings(config.fit, people=config.moves_people)
 
 
 def _open_cache(config: SceneOptions) -> SceneCache | None:

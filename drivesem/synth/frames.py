@@ -328,7 +328,7 @@ def plan_frame(
     view = _camera(rng[0], settings)
     road = plan_road(rng[1], layout.kinds)
     actors = place_vehicles(rng[1], road, layout)
-    if layout.people:
+    for _ in range(layout.crowd if layout.people else 0):
         actors += place_people(rng[2], road, actors)
     light = draw_light(rng[3], view.up, settings.sunny)
     if settings.skies:

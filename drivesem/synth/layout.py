@@ -251,8 +251,9 @@ class Actor:
 @dataclass(frozen=True, slots=True)
 class LayoutSettings:
     """variants: (first, count) of the vehicle shapes to draw from. people: whether pedestrians and cyclists
-    appear. vehicles: (fewest, most) to be seen a frame, or None for KITTI's distribution. max_heavy: most trucks
-    and buses. fleet: vehicles from files, used instead of the templates of their type.
+    appear. crowd: times as many people. vehicles: (fewest, most) to be seen a frame, or None for KITTI's
+    distribution. max_heavy: most trucks and buses. fleet: vehicles from files, used instead of the templates of
+    their type.
     """
 
     variants: tuple[int, int] = (0, 100)
@@ -261,6 +262,7 @@ class LayoutSettings:
     max_heavy: int = 3
     kinds: tuple[str, ...] = field(default=ROAD_KINDS)
     fleet: tuple[VehicleMesh, ...] = ()
+    crowd: int = 1
 
 
 def plan_road(rng: np.random.Generator, kinds: tuple[str, ...] = ROAD_KINDS) -> Road:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from scene_ir.derender import patch_fill, street
 from scene_ir.derender.segmentation import Segmentation
-from scene_ir.derender.silhouette import grow_mask
+from scene_ir.derender.silhouette import grow_mask, mask_bounds
 from scene_ir.derender.standing_surfaces import ColumnCopySettings, copy_columns
+from scene_ir.image_filters import push_pull
 from scene_ir.types import Camera
 
 Array = NDArray[np.float32]
@@ -30,6 +31,10 @@ _VEHICLE_SHARE, _MIN_CORE_PX, _AROUND_CORE_PX = 0.97, 150, 150
 """Share and least area of the core of an unlabelled vehicle, and how far its less certain rest extends."""
 _MIN_REST = 0.05
 """A smaller share of all but vehicles carries no information."""
+_SEAM = 0.06
+"""Width of the border along which a person's fill takes the colours around it, in heights."""
+_NEAR_THIN = 1.5
+"""Range around a person from which patches are copied, in heights."""
 _BORDER_PX = 5
 """Pixels this near to vehicles and shadows are not copied: their colours are mixed, and masks have errors."""
 
@@ -139,6 +144,28 @@ class BackgroundFill:
         filled = self._fill_hole(_scale_mask(hole, self._work.shrink), seed)
         return filled if self._work is self._full else self._full.enlarge(filled, hole)
 
+    def fill_thin(self, filled: Array, thin: Mask, hole: Mask, seed: int) -> Array:
+        """The image (H, W, 3) with what stood before it filled by patches of what is near, as suits objects that
+        are narrower than what they hide.
+
+        Args:
+            filled: The image, filled otherwise.
+            thin: Pixels (H, W) of one person.
+            hole: All filled pixels (H, W), not copied.
+            seed: Of the random search.
+        """
+        x0, y0, x1, y1 = mask_bounds(thin)
+        reach = round(_NEAR_THIN * (y1 - y0))
+        window = (slice(max(y0 - reach, 0), y1 + reach), slice(max(x0 - reach, 0), x1 + reach))
+        inputs = self._full.inputs
+        forbidden = _excluded_pixels(self._full, hole)[window] | (grow_mask(hole, 1) & ~thin)[window]
+        ground = patch_fill.GroundMaps(np.zeros_like(thin[window]), inputs.maps.ground[window].astype(np.float32))
+        image = filled.copy()
+        horizon = inputs.horizon - window[0].start
+        patched = patch_fill.fill_patches(filled[window], thin[window], forbidden, horizon, ground, seed)
+        image[window] = _hide_seam(patched, thin[window], _SEAM * (y1 - y0))
+        return image
+
     def _fill_hole(self, hole: Mask, seed: int) -> Array:
         work, shrink = self._work, self._work.shrink
         maps, horizon = work.inputs.maps, work.inputs.horizon
@@ -174,6 +201,17 @@ class BackgroundFill:
         return street.continue_street(
             coarse.image, unknown, shares, self._coordinates, coarse.inputs.horizon, coarse.shrink
         )
+
+
+def _hide_seam(filled: Array, hole: Mask, width: float) -> Array:
+    """An image (H, W, 3) in which the filled hole (H, W) has the colours around it, smoothed, along its border of this
+    width, px: its contour would remind of what stood there.
+    """
+    around = push_pull(filled, 1 - hole.astype(np.float32))
+    smooth = [cv2.GaussianBlur(part, (0, 0), max(width / 2, 1.0)) for part in (around, filled)]
+    inside = cv2.distanceTransform(hole.astype(np.uint8), cv2.DIST_L2, 5)
+    weight = (hole * np.exp(-inside / max(width, 1.0)))[..., None]
+    return np.clip(filled + weight * (smooth[0] - smooth[1]), 0, 1).astype(np.float32)
 
 
 def _excluded_pixels(view: _View, unknown: Mask) -> Mask:

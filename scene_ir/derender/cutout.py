@@ -160,10 +160,10 @@ class CutoutNet(nn.Module):
         return (before.log() + self.second(x)).log_softmax(1)
 
 
-@lru_cache(maxsize=1)
-def load_network() -> CutoutNet:
-    """The shipped network, in eval mode. Raises FormatError if its weights are missing or damaged."""
-    return load_frozen(CutoutNet(), WEIGHTS)
+@lru_cache(maxsize=2)
+def load_network(path: Path = WEIGHTS) -> CutoutNet:
+    """A network of shipped weights, in eval mode. Raises FormatError if they are missing or damaged."""
+    return load_frozen(CutoutNet(), path)
 
 
 def crop_rectangle(placement: Placement, camera: Camera) -> tuple[int, int, int, int] | None:

@@ -12,7 +12,18 @@ from numpy.typing import NDArray
 
 from scene_ir.derender import alignment as icp
 from scene_ir.derender import alignment as template_choice
-from scene_ir.derender import cutout, delight, depth, ego, occluders, paint_mask, segmentation, shadow, silhouette
+from scene_ir.derender import (
+    cutout,
+    delight,
+    depth,
+    ego,
+    occluders,
+    paint_mask,
+    people,
+    segmentation,
+    shadow,
+    silhouette,
+)
 from scene_ir.derender import depth as ground_geometry
 from scene_ir.derender import matte as mask_extension
 from scene_ir.derender.background_fill import BackgroundFill, BackgroundInputs
@@ -45,7 +56,9 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 VEHICLE_CATEGORIES = {"Car": Category.CAR, "Van": Category.CAR, "Truck": Category.TRUCK}
-"""Label types that become objects; all others stay in the background. Vans count as cars, as in the paper."""
+"""Label types that become vehicles. Vans count as cars, as in the paper."""
+_CATEGORIES = VEHICLE_CATEGORIES | people.PEOPLE_CATEGORIES
+"""Label types that can become objects; all others stay in the background."""
 
 _MIN_SIDE_PX = 16
 """Smallest side of a photograph: maps are computed at an eighth of its size."""
@@ -53,6 +66,8 @@ _MAX_LABELS = 500
 """Labels of a frame: each vehicle takes megabytes and a second."""
 _FADE = (0.08, 0.45)
 """Opacity of a vehicle up to which the background is the photograph, and from which it is the fill."""
+_TRACE_OPACITY = 0.05
+"""Least opacity of people where they may be: what of them is in the photograph there is solved for."""
 _FADE_OCCLUDER = 0.98
 """Opacity of an occluder from which the background is the photograph."""
 _OUTLINE_TOLERANCE = 0.015
@@ -94,6 +109,8 @@ class DerenderSettings:
     """A user's meshes to choose from besides the templates."""
     segmenter: segmentation.Segmenter | None = None
     """A user's segmenter in place of the shipped network."""
+    people: bool = False
+    """Make objects of people and cyclists too, where they can be cut out whole."""
     withheld_kinds: tuple[str, ...] = ()
     """For each label a template kind that it may not be, "" for none; empty for no restrictions."""
     known_placements: tuple[Placement | None, ...] = ()
@@ -109,7 +126,7 @@ class DerenderSettings:
 
 @dataclass(frozen=True, slots=True)
 class _VehicleCutout:
-    """One vehicle cut out of the photograph."""
+    """One vehicle or person cut out of the photograph."""
 
     row: int
     """Row of its label."""
@@ -124,12 +141,15 @@ class _VehicleCutout:
     """IoU of mask and outline."""
     cutout: Cutout
     """Shares of pixels."""
+    reach: Mask | None = None
+    """(H, W), of people: pixels that leave with them."""
 
 
 def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     """Separate a photograph into vehicles, their shadows and the background behind them.
 
-    Cars, vans and trucks with a 3D box become objects, in the labels' order. Masks and depth of the frame replace
+    Cars, vans and trucks with a 3D box become objects, in the labels' order; with `settings.people` also pedestrians
+    and cyclists that can be cut out whole. Masks and depth of the frame replace
     estimates. The unperturbed render of the scene is the photograph. Raises ShapeError without labels, RangeError
     for a labelled box behind the camera, a tiny photograph or too many labels.
     """
@@ -138,11 +158,14 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     camera, image = frame.camera, _frame_image(frame)
     ground = ground_geometry.fit_ground(labels, _posed_rows(labels))
 
-    # Vehicles and what stands in front of them.
+    # Vehicles and people, and what stands in front of them.
     ego_mask = _find_ego_vehicle(frame, image)
     rows = [rows[i] for i in ego.boxes_outside(ego_mask, labels.boxes_xyxy[rows])]
-    occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask)
-    cuts = _cut_out_vehicles(image, frame, rows, settings, occluder_masks)
+    persons, left_out = _cut_out_people(frame, image, ground, settings)
+    occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask, [person.row for person in persons])
+    in_front = occluder_masks + [OccluderMask(p.mask, _depth_m(p.placement, camera)) for p in persons]
+    cuts = _cut_out_vehicles(image, frame, rows, settings, in_front)
+    cuts = sorted([*cuts, *_place_people(persons, cuts, settings, camera)], key=lambda cut: cut.row)
     occluder_masks += _find_unlabelled_occluders(frame, cuts, occluder_masks, ground)
     occluder_masks.sort(key=lambda occluder: occluder.depth_m)
     cuts = _remove_occluders(cuts, occluder_masks, camera)
@@ -159,7 +182,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         ground_geometry.horizon_row(ground, camera),
         ground,
         camera,
-        _non_vehicle_boxes(labels, camera) | (ego_opacity > 0),
+        _background_boxes(labels, camera, [cut.row for cut in cuts]) | (ego_opacity > 0),
         sum(opacities, np.zeros(image.shape[:2], np.float32)),
         maps,
     )
@@ -186,6 +209,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         provenance[f"objects[{index}].label"] = str(cut.row)
         provenance[f"objects[{index}].mesh"] = cut.placement.mesh.name
         provenance[f"objects[{index}].mask_iou"] = f"{cut.agreement:.3f}"
+    provenance |= {f"labels[{row}].background": reason for row, reason in left_out.items()}
     # People, trams and vehicles that were not cut out stay in the background, and no detection counts there.
     object_rows = {cut.row for cut in cuts}
     other_labels = labels.select([row for row in range(len(labels.kind)) if row not in object_rows])
@@ -289,13 +313,16 @@ def _find_ego_vehicle(frame: Frame, image: Array) -> Mask | None:
 
 
 def _find_labelled_occluders(
-    frame: Frame, image: Array, rows: list[int], ego_mask: Mask | None
+    frame: Frame, image: Array, rows: list[int], ego_mask: Mask | None, persons: Sequence[int] = ()
 ) -> list[OccluderMask]:
-    """The ego vehicle, if it is visible, then people and the like in front of vehicles, by their labels."""
+    """The ego vehicle, if it is visible, then people and the like in front of objects, by their labels; without those
+    in the rows `persons`, which are objects.
+    """
     labels = frame.labels
     assert labels is not None
-    others = [row for row in _posed_rows(labels) if labels.kind[row] not in VEHICLE_CATEGORIES]
-    labelled = occluders.find_labelled_occluders(_to_uint8(image), frame, rows, others)
+    unmoved = set(_posed_rows(labels)).difference(persons)
+    others = [row for row in sorted(unmoved) if labels.kind[row] not in VEHICLE_CATEGORIES]
+    labelled = occluders.find_labelled_occluders(_to_uint8(image), frame, [*rows, *persons], others)
     if ego_mask is None:
         return labelled
     rest = [replace(occluder, mask=occluder.mask & ~ego_mask) for occluder in labelled]
@@ -314,6 +341,38 @@ def _find_unlabelled_occluders(
     nearest = [(cut.outline, occluders.nearest_corner_depth(cut.placement, frame.camera)) for cut in cuts]
     height = height_above_ground(frame.depth, ground, frame.camera.matrix).float().numpy()
     return occluders.find_measured_occluders(frame.depth.float().numpy(), height, known, nearest)
+
+
+def _cut_out_people(
+    frame: Frame, image: Array, ground: torch.Tensor, settings: DerenderSettings
+) -> tuple[list[people.PersonCutout], dict[int, str]]:
+    """The people that become objects, if any may, and by row why others stay in the background."""
+    if not settings.people or frame.labels is None:
+        return [], {}
+    return people.cut_out_people(_to_uint8(image), frame, _posed_rows(frame.labels), ground, settings.backend)
+
+
+def _place_people(
+    persons: list[people.PersonCutout], vehicles: list[_VehicleCutout], settings: DerenderSettings, camera: Camera
+) -> list[_VehicleCutout]:
+    """People without the pixels of nearer vehicles."""
+    outlines = silhouette.render_silhouettes([p.placement for p in persons], camera, settings.backend)
+    placed = []
+    for person, outline in zip(persons, outlines, strict=True):
+        own = _depth_m(person.placement, camera)
+        hidden = _union([c.mask for c in vehicles if _depth_m(c.placement, camera) < own], outline.shape)
+        mask = person.mask & ~hidden
+        if mask.any():
+            agreement = mask_iou(mask, outline, hidden)
+            parts = (mask, hidden, outline, agreement, person.cutout, person.reach & ~hidden)
+            placed.append(_VehicleCutout(person.row, person.placement, *parts))
+    return placed
+
+
+def _depth_m(placement: Placement, camera: Camera) -> float:
+    """Depth of an object along the optical axis, m."""
+    place = placement.translation.detach()[None]
+    return float(to_clip(place, camera.matrix.to(place))[0, 2])
 
 
 def _cut_out_vehicles(
@@ -566,11 +625,13 @@ def _label_box_mask(labels: Labels, row: int, shape: tuple[int, int]) -> Mask:
     return inside
 
 
-def _non_vehicle_boxes(labels: Labels, camera: Camera) -> Mask:
-    """Pixels (H, W) in the boxes of labels that are no vehicles: nothing is copied from there."""
+def _background_boxes(labels: Labels, camera: Camera, objects: list[int]) -> Mask:
+    """Pixels (H, W) in the boxes of labels that are neither vehicles nor in the rows `objects`: nothing is copied from
+    there.
+    """
     inside = np.zeros((camera.height, camera.width), bool)
-    for kind, box in zip(labels.kind, labels.boxes_xyxy.tolist(), strict=True):
-        if kind not in VEHICLE_CATEGORIES:
+    for row, (kind, box) in enumerate(zip(labels.kind, labels.boxes_xyxy.tolist(), strict=True)):
+        if kind not in VEHICLE_CATEGORIES and row not in objects:
             x0, y0, x1, y1 = (max(int(side), 0) for side in box)
             inside[y0 : y1 + 2, x0 : x1 + 2] = True
     return inside
@@ -600,7 +661,7 @@ def _remove_occluders(
     """The vehicles without their occluders' pixels. A vehicle that would vanish stays as it was."""
     visible = []
     for cut in cuts:
-        depth_m = float(to_clip(cut.placement.translation.detach()[None], camera.matrix)[0, 2])
+        depth_m = _depth_m(cut.placement, camera)
         hidden = occluders.mask_nearer_occluders(occluder_masks, depth_m, cut.mask.shape)
         rest = cut.mask & ~hidden
         visible.append(replace(cut, mask=rest, hidden=cut.hidden | hidden) if rest.any() else cut)
@@ -636,8 +697,14 @@ def _separate_layers(
     for cut, region, view in zip(cuts, shaded, views, strict=True):
         hole |= grow_mask(view.in_frame(region, hole.shape), 2.5) | grow_mask(cut.mask, 4)
         hole[view.window] |= view.distance < 0.2
+    reaches = [(i, cut.reach) for i, cut in enumerate(cuts) if cut.reach is not None]
+    for _, reach in reaches:
+        hole |= grow_mask(reach, 2)
     filled = fill.fill_hole(hole, settings.seed)
     mattes = [cutout_opacity(cut.cutout, cut.mask, cut.hidden) for cut in cuts]
+    for i, reach in reaches:
+        filled = fill.fill_thin(filled, grow_mask(reach, 2), hole, settings.seed)
+        mattes[i] = np.maximum(mattes[i], _TRACE_OPACITY * reach).astype(np.float32)
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
     for region, view in zip(shaded, views, strict=True):
@@ -647,7 +714,8 @@ def _separate_layers(
             beyond = cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 5)
             shadow_share[wide] = np.maximum(shadow_share[wide], np.clip(1.25 - beyond / 2.5, 0, 1))
     # Where a matte is thin, most of the pixel is background already: the fill fades into it.
-    replaced = np.clip(np.maximum(shadow_share, (opaque - _FADE[0]) / (_FADE[1] - _FADE[0])), 0, 1)[..., None]
+    replaced = np.clip(np.maximum(shadow_share, (opaque - _FADE[0]) / (_FADE[1] - _FADE[0])), 0, 1)
+    replaced = np.maximum(replaced, _union([reach for _, reach in reaches], replaced.shape))[..., None]
     mixed = image + (filled - image) * replaced
     # A shadow only darkens: where the fill is darker than the photograph, the photograph is the background.
     only_shadow = (opaque == 0)[..., None]
@@ -696,8 +764,7 @@ def _min_background_depth(cuts: list[_VehicleCutout], camera: Camera) -> Array:
     """Least depth (H, W) m of the background behind vehicles: that of their middle; 0 where there is none."""
     middle = np.zeros((camera.height, camera.width), np.float32)
     for cut in cuts:
-        place = cut.placement.translation.detach()[None]
-        depth_m = float(to_clip(place, camera.matrix.to(place))[0, 2])
+        depth_m = _depth_m(cut.placement, camera)
         middle = np.where(cut.outline, np.maximum(middle, np.float32(depth_m)), middle)
     return middle
 
@@ -744,7 +811,7 @@ def _make_objects(labels: Labels, cuts: list[_VehicleCutout]) -> tuple[Objects, 
         stack("size_lhw", 3),
         stack("ffd", LATTICE_POINTS, 3),
         torch.zeros(len(cuts), TEXTURE_DIM),
-        torch.tensor([int(VEHICLE_CATEGORIES[labels.kind[row]]) for row in rows], dtype=torch.int64),
+        torch.tensor([int(_CATEGORIES[labels.kind[row]]) for row in rows], dtype=torch.int64),
         labels.boxes_xyxy[rows].float(),
         labels.truncation[rows].float(),
         labels.occlusion[rows],

@@ -52,13 +52,15 @@ class _ColourModel:
 
 
 def add_paint_regions(scene: SceneIR, backend: verbs.Backend = "warp") -> SceneIR:
-    """The scene with the `Source.region` of each object estimated. Needs `objects.source`."""
+    """The scene with the `Source.region` of each vehicle estimated: clothes have no one colour. Needs
+    `objects.source`.
+    """
     if not scene.objects.source:
         return scene
     parts = Compositor(scene, RenderSettings(backend)).project_paint()
     sources = tuple(
-        replace(source, region=estimate_paint_region(source.foreground, part))
-        for source, part in zip(scene.objects.source, parts, strict=True)
+        source if upright else replace(source, region=estimate_paint_region(source.foreground, part))
+        for source, part, upright in zip(scene.objects.source, parts, scene.objects.upright.tolist(), strict=True)
     )
     return replace(scene, objects=replace(scene.objects, source=sources))
 

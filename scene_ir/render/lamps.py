@@ -65,6 +65,7 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     unit = torch.stack([find_lamp_places(mesh) for mesh in meshes]).to(like)
     weights = ffd.lattice_weights(unit.reshape(-1, 3)).reshape(*unit.shape[:2], -1)
     driven = torch.stack([is_driven(scene, base, i) for i in range(len(base))]).to(like)
+    driven = driven * ~base.upright.to(driven.device)
     front = torch.tensor([x > 0 for x, _ in _QUADRANTS]).repeat(len(base), 1)
     still = VehicleLamps(unit, weights, torch.zeros_like(unit[..., :2]), driven, front)
     xy, depth, facing = project_lamps(still, scene, base, centre)

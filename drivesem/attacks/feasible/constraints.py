@@ -30,6 +30,7 @@ from drivesem.attacks.feasible.vehicles import (
 )
 from drivesem.attacks.space import ParameterSpace
 from scene_ir import ffd
+from scene_ir.geometry import height_above_ground, project
 from scene_ir.types import LATTICE, SceneIR
 
 
@@ -259,6 +260,9 @@ def _inside_integral(a: Array, b: Array) -> Array:
     return (np.where(inside, leave - enter, 0.0) * cross).sum(axis=1)
 
 
+_STANDS_ON, _SURE_ROAD, _LEVEL_M = 0.5, 0.3, 0.3
+"""Share of road, or of grass, from which a person stands on it; how much more makes sure of it; height over the ground
+plane up to which ground is level, m."""
 _FOOTPRINT_GRID = (10, 16)
 """Cells along and across a footprint; the road map is sampled at their centres."""
 _FOOTPRINT = cell_centres(*_FOOTPRINT_GRID)
@@ -266,15 +270,26 @@ _FOOTPRINT = cell_centres(*_FOOTPRINT_GRID)
 
 
 class RoadMap:
-    """A scene's road map, sampled under footprints."""
+    """The road of a scene, sampled under footprints. People and cyclists off the road have the level ground there in
+    its place; those that do not stand on grass, without what is green: it may be a bush.
+    """
 
     def __init__(self, scene: SceneIR) -> None:
-        self._road = to_float64_array(scene.environment.road).reshape(-1)
+        road, upright = to_float64_array(scene.environment.road), scene.objects.upright.cpu().numpy()
+        maps, kind = [road], np.zeros(len(upright), np.int64)
+        if upright.any():
+            foliage = to_float64_array(scene.environment.foliage_map)
+            level = _level_ground(scene) * (1 - np.clip((road - _STANDS_ON) / _SURE_ROAD, 0, 1))
+            maps += [level * (1 - foliage), level]
+            on_road, on_grass = (_sample_feet(values, scene) >= _STANDS_ON for values in (road, foliage))
+            kind = np.where(upright & ~on_road, 1 + on_grass, 0)
+        self._road = np.concatenate([one.reshape(-1) for one in maps])
+        self._start = kind * road.size
         self._width = scene.camera.width
         self._limit = np.array([scene.camera.width - 1.0, scene.camera.height - 1.0])
 
     def measure_share(self, view: VehicleProjections, rows: Indices | slice = slice(None)) -> Array:
-        """Mean of the road map (M,) under the footprints in `rows` of `view`; 1 where fewer than a quarter of a
+        """Mean of the map (M,) under the footprints in `rows` of `view`; 1 where fewer than a quarter of a
         footprint's points lie in the image.
         """
         clip = view.corner[rows][:, :, None] + view.edges[rows] @ _FOOTPRINT
@@ -284,13 +299,28 @@ class RoadMap:
         inside = (exact == pixels).all(axis=1) & (depth > NEAR_M)
         cell = np.minimum(pixels, self._limit[:, None] - 1).astype(np.int64)
         across, down = (pixels - cell).swapaxes(0, 1)
-        index = cell[:, 1] * self._width + cell[:, 0]
+        index = cell[:, 1] * self._width + cell[:, 0] + self._start[view.rows[rows], None]
         top, bottom = self._road[index], self._road[index + self._width]
         top = top + across * (self._road[index + 1] - top)
         bottom = bottom + across * (self._road[index + self._width + 1] - bottom)
         count = inside.sum(axis=1)
         share = ((top + down * (bottom - top)) * inside).sum(axis=1) / np.maximum(count, 1)
         return np.where(count * 4 >= inside.shape[1], share, 1.0)
+
+
+def _sample_feet(values: Array, scene: SceneIR) -> Array:
+    """Values (N,) of a map (H, W) at the pixels where objects meet the ground."""
+    matrix = scene.camera.matrix.to(scene.objects.translation)
+    pixels = project(scene.objects.translation, matrix).detach().cpu().round().long()
+    columns, rows = (pixels[:, k].clamp(0, n - 1) for k, n in enumerate((values.shape[1], values.shape[0])))
+    return values[rows.numpy(), columns.numpy()]
+
+
+def _level_ground(scene: SceneIR) -> Array:
+    """Pixels (H, W), 0 or 1, at which the background is level ground, not a wall or the like in front of it."""
+    ground, matrix = scene.environment.ground, scene.camera.matrix
+    height_m = to_float64_array(height_above_ground(scene.depth, ground, matrix))
+    return (np.abs(height_m) < _LEVEL_M).astype(np.float64)
 
 
 _STRAIN_GRID = (5, 5, 5)

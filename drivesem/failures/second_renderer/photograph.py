@@ -216,7 +216,8 @@ class PhotographRenderer:
                 self._occluder_layers(window),
             )
         image = shading.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
-        image = apply_night(image, depth_m, owner, environment, camera, poses, to_numpy(objects.lamps))
+        lamps = np.where(objects.upright.cpu().numpy(), -1.0, to_numpy(objects.lamps))  # people have none
+        image = apply_night(image, depth_m, owner, environment, camera, poses, lamps)
         if environment.ego is not None:
             inside = darken_inside(self._photograph, environment)
             image = image + (inside - image) * to_numpy(environment.ego)[..., None]

@@ -27,8 +27,8 @@ class ExchangedSceneRenderer:
     """
 
     def __init__(self, identifier: str, scene: SceneIR) -> None:
-        self._before = PhotographRenderer(identifier, scene.origin)
-        self._after = PhotographRenderer(identifier, scene, before=self._before)
+        self._before = _make_photograph_renderer(identifier, scene.origin)
+        self._after = _make_photograph_renderer(identifier, scene, self._before)
 
     @property
     def name(self) -> str:
@@ -101,12 +101,24 @@ class SecondRenderers:
         if scene.before is not None:
             return ExchangedSceneRenderer(identifier, scene)
         is_demo = scene.provenance.get("dataset") == DEMO
-        if self._folder is None and not is_demo:
-            return PhotographRenderer(identifier, scene)
+        photographed = self._folder is None and not is_demo
+        if photographed or bool(scene.objects.upright.any()):  # plans hold no surfaces of people
+            return _make_photograph_renderer(identifier, scene)
         from drivesem.failures.second_renderer.generator import DemoPlans, GeneratorRenderer
 
         plans = DemoPlans() if is_demo or self._folder is None else self._folder
         return GeneratorRenderer(identifier, scene, plans)
+
+
+def _make_photograph_renderer(
+    identifier: str, scene: SceneIR, before: PhotographRenderer | None = None
+) -> PhotographRenderer:
+    """Renderer of a photograph's scene. It has no mattes, so the surfaces of people get the outlines of theirs."""
+    if bool(scene.objects.upright.any()):
+        from scene_ir.derender.upright import trim_to_mattes
+
+        scene = trim_to_mattes(scene)
+    return PhotographRenderer(identifier, scene, before=before)
 
 
 def _find_folder_plans(dataset: str, root: str | None) -> PlanSource | None:

@@ -475,7 +475,7 @@ def describe_outcome(one: FrameOutcome) -> str:
 def _describe_vehicles(one: FrameOutcome) -> str:
     result = one.result
     counts = f"{len(result.judged)} judged, {len(result.found_before)} found before"
-    return f"{format_count(result.objects, 'vehicle')}, {counts}"
+    return f"{format_count(result.objects, 'object')}, {counts}"
 
 
 def _shared(sets: Sequence[tuple[BoxMark, ...]]) -> tuple[tuple[tuple[int, ...], tuple[BoxMark, ...]], ...]:

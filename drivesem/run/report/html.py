@@ -228,13 +228,13 @@ def _lead(runs: Sequence[ReportedRun]) -> str:
     summary = runs[0].summary
     frames = format_count(summary.frames, "frame")
     if len(runs) > 1:
-        return f"The same {frames} of {summary.dataset}, with {format_count(summary.objects.all, 'vehicle')}."
+        return f"The same {frames} of {summary.dataset}, with {format_count(summary.objects.all, summary.noun)}."
     data = f"{summary.dataset} ({grading.describe_frames(summary)}; {grading.describe_objects(summary)})"
     changed = " + ".join(summary.params)
     return (
         f"{changed} changed by {runs[0].method} within feasible limits, on {data}. Each failure was correct "
         f"before "
-        "the change, and is evaluated with labels that moved with the vehicles."
+        f"the change, and is evaluated with labels that moved with the {summary.noun}s."
     )
 
 
@@ -252,14 +252,14 @@ def _tiles(run: ReportedRun) -> list[_SummaryTile]:
         _SummaryTile(
             "missed before the attack",
             f"{missed.count} of {missed.of}",
-            f"{missed.percent} of judged vehicles; {objects.all} vehicles in all"
+            f"{missed.percent} of judged {summary.noun}s; {objects.all} {summary.noun}s in all"
             if missed.of
             else "none is judged",
         ),
         _SummaryTile(
             "lost, by threshold",
             f"{lost_share.count} of {lost_share.of}",
-            f"{lost_share.percent} of vehicles found before; {_by_class(summary)}"
+            f"{lost_share.percent} of {summary.noun}s found before; {_by_class(summary)}"
             if lost_share.of
             else "none is found before",
         ),
@@ -290,7 +290,8 @@ def _graded_tile(run: ReportedRun) -> list[_SummaryTile]:
     if not grading.is_known(run.summary, run.frames):
         return [_SummaryTile("certain failures", "unknown", "the failures of this run are not graded")]
     more = f"{grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared; the others by threshold only. "
-    more += f"Certainly lost: {run.summary.lost_by_grade[str(Grade.CERTAIN)].format('vehicles found before')}"
+    lost = run.summary.lost_by_grade[str(Grade.CERTAIN)]
+    more += f"Certainly lost: {lost.format(f'{run.summary.noun}s found before')}"
     return [_SummaryTile("certain failures", f"{grades[Grade.CERTAIN]} of {failures}", more)]
 
 

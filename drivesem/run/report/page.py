@@ -502,13 +502,16 @@ def describe_frames(summary: RunSummary) -> str:
     text, left = format_count(summary.frames, "frame"), len(summary.frames_not_attacked)
     if not left:
         return f"{text} attacked"
-    return f"{text}: {summary.frames_attacked} attacked, {left} not attacked (no vehicle judged and found before)"
+    reason = f"no {summary.noun} judged and found before"
+    return f"{text}: {summary.frames_attacked} attacked, {left} not attacked ({reason})"
 
 
 def describe_objects(summary: RunSummary) -> str:
     """Describe vehicles: `26 vehicles: 13 judged, 8 found before the attack`."""
     objects = summary.objects
-    text = f"{format_count(objects.all, 'vehicle')}: {objects.judged} judged, {objects.found_before} found before"
+    text = (
+        f"{format_count(objects.all, summary.noun)}: {objects.judged} judged, {objects.found_before} found before"
+    )
     return f"{text} the attack"
 
 

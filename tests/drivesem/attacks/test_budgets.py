@@ -74,7 +74,7 @@ def test_a_preset_can_be_narrowed_and_not_widened():
     assert parse_budget("street,translate=2m,rotate=5deg") == replace(
         PRESETS["street"], translate_m=2.0, rotate=math.radians(5)
     )
-    assert parse_budget("street,translate=0.1") == replace(PRESETS["street"], translate=0.1)
+    assert parse_budget("street,translate=0.1") == replace(PRESETS["street"], translate=0.1, walk_m=0)
     assert parse_budget("parking,rotate=2deg") == replace(PRESETS["parking"], rotate=math.radians(2))
     for text in ("street,translate=50m", "street,translate=50", "parking,translate=0.6m", "street,rotate=0.36"):
         with pytest.raises(FormatError, match=r"--budget: .*: expected a positive number of at most"):

@@ -193,7 +193,7 @@ def test_kitti_folder(kitti_folder: Path, tmp_path: Path) -> None:
 def test_a_frame_without_detections_before_is_not_attacked(tmp_path: Path) -> None:
     words = [*WORDS, "--limit", "1", "--out", tmp_path / "run", "--t-star", "0.9999"]
     metrics = run_json(*words)
-    assert metrics["frames_not_attacked"] == {"demo-000": "none of 6 judged vehicles is found before"}
+    assert metrics["frames_not_attacked"] == {"demo-000": "none of 6 judged objects is found before"}
     assert (metrics["frames"], metrics["frames_attacked"], metrics["queries"]) == (1, 0, 0)
     assert metrics["objects"] == {"all": 6, "judged": 6, "found_before": 0}
     assert metrics["broken"] == {"count": 0, "of": 0, "low": None, "high": None}
@@ -205,7 +205,7 @@ def test_a_frame_without_detections_before_is_not_attacked(tmp_path: Path) -> No
     last = output.splitlines()[-1]
     assert last.startswith("nothing to attack: 6 judged, 0 found by squeezedet, of 6 vehicles")
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "not attacked: none of 6 judged vehicles is found before" in page
+    assert "not attacked: none of 6 judged objects is found before" in page
     assert "withstood" not in page
     assert last[1:] in page
 

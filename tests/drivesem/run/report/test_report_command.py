@@ -243,8 +243,8 @@ def test_frames_that_were_not_attacked_are_in_no_denominator(
     text = " ".join(parse(run / "report.html").text.split())
     assert "4 frames: 2 attacked, 2 not attacked (no vehicle judged and found before)" in text
     assert "8 vehicles: 6 judged, 4 found before the attack" in text
-    assert "not attacked: none of 2 judged vehicles is found before" in text
-    assert "not attacked: none of 2 vehicles is judged: under 25 px high" in text
+    assert "not attacked: none of 2 judged objects is found before" in text
+    assert "not attacked: none of 2 objects is judged: under 25 px high" in text
     assert "25 % [5, 70] of vehicles found before" in text
     assert "33 % [10, 70] of judged vehicles" in text
     assert text.count("withstood") == 2  # frame 2, in the gallery and in the table

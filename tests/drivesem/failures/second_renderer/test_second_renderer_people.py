@@ -1,0 +1,47 @@
+"""People in the second renderer, and which renderer a generated frame with people gets."""
+
+import numpy as np
+import pytest
+import torch
+
+from drivesem.failures.second_renderer.selection import SecondRenderers
+from drivesem.synth.frames import plan_frame, render_frame
+from scene_ir.derender import upright
+from scene_ir.derender.derender import DerenderSettings, derender
+from scene_ir.render.compositor import Compositor
+from scene_ir.types import Frame, SceneIR
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneIR:
+    """A generated street with people on the pavement, cut out by the network."""
+    frame = render_frame(plan_frame(3, 0))
+    assert frame is not None
+    photograph = torch.from_numpy(frame.image.astype(np.float32) / 255).permute(2, 0, 1).contiguous()
+    found = Frame("generated", photograph, frame.camera, frame.labels)
+    return derender(found, DerenderSettings(fit=False, people=True))
+
+
+def test_both_renderers_draw_a_moved_person_alike(scene, screen):
+    (row, *_) = scene.objects.upright.nonzero()[:, 0].tolist()
+    renderer = SecondRenderers("kitti", None).renderer_for("generated", scene)
+    assert renderer.name == "pyrender"
+    translation = scene.objects.translation.clone()
+    translation[row, 0] += 0.5
+    moved = scene.with_objects(translation=translation)
+    first, second = Compositor(scene).render(moved), renderer.render(moved)
+    crop = first.opacity[row]
+    h, w = crop.values.shape[1:]
+    window = np.s_[:, crop.y0 : crop.y0 + h, crop.x0 : crop.x0 + w]
+    person = crop.values[0] > 0.9
+    apart = (first.image[window] - second.image[window]).abs().mean(0)
+    assert float(apart[person].mean()) < 0.06
+    before = (scene.photograph[window] - second.image[window]).abs().mean(0)
+    assert float(before[person].mean()) > 2 * float(apart[person].mean())
+
+
+def test_surfaces_get_the_outlines_of_their_mattes(scene):
+    trimmed = upright.trim_to_mattes(scene)
+    for row, flag in enumerate(scene.objects.upright.tolist()):
+        index = int(scene.objects.mesh_index[row])
+        assert (trimmed.meshes[index] is scene.meshes[index]) != flag

@@ -1,0 +1,228 @@
+"""People and cyclists as upright surfaces: cut out of a painted street, put back, moved."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from scene_ir.derender import people, upright
+from scene_ir.derender.derender import DerenderSettings, derender
+from scene_ir.derender.silhouette import render_silhouettes
+from scene_ir.geometry import project
+from scene_ir.io import load_scene, save_scene
+from scene_ir.render.compositor import Compositor
+from scene_ir.render.prepare import RenderSettings
+from scene_ir.render.surfaces import TemplateSurface
+from scene_ir.types import Category, Frame, Labels, Part, SceneIR, convert_scene
+
+FOCAL, CENTRE, HORIZON = 380.0, 239.5, 88.0
+PLACE = (-2.5, 1.65, 9.0)
+CLOTHES = np.array([0.75, 0.2, 0.15], np.float32)
+
+
+def paint_person(image: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
+    """Paint a person who stands at a place, 1.75 m high, into an image (H, W, 3); the opacity (H, W)."""
+    x, ground, z = place
+    scale = 16.0
+    share = np.zeros((int(image.shape[0] * scale / 4), int(image.shape[1] * scale / 4)), np.uint8)
+
+    def at(right: float, up: float) -> tuple[int, int]:
+        u, v = CENTRE + FOCAL * (x + right) / z, HORIZON + FOCAL * (ground - up) / z
+        return round((u + 0.5) * scale / 4), round((v + 0.5) * scale / 4)
+
+    def size(metres: float) -> int:
+        return max(round(FOCAL * metres / z * scale / 4), 1)
+
+    cv2.circle(share, at(0, 1.62), size(0.13), 255, -1)
+    cv2.rectangle(share, at(-0.22, 1.48), at(0.22, 0.85), 255, -1)
+    for side in (-1, 1):
+        cv2.line(share, at(0.1 * side, 0.85), at(0.16 * side, 0.03), 255, size(0.14))
+    alpha = cv2.resize(share, image.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    rows = np.arange(image.shape[0])[:, None, None]
+    head = HORIZON + FOCAL * (ground - 1.48) / z
+    colour = np.where(rows < head, np.array([0.8, 0.6, 0.5], np.float32), CLOTHES)
+    image += alpha[..., None] * (colour - image)
+    return alpha
+
+
+def label_person(labels: Labels, mask: np.ndarray, **changes: object) -> Labels:
+    """The labels and that of a person with this mask."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    box = torch.tensor([[columns[0], rows[0], columns[-1], rows[-1]]], dtype=torch.float32)
+    own = {
+        "boxes_xyxy": box,
+        "truncation": torch.zeros(1),
+        "occlusion": torch.zeros(1, dtype=torch.int64),
+        "translation": torch.tensor([PLACE]),
+        "yaw": torch.tensor([0.4]),
+        "size_lhw": torch.tensor([[0.8, 1.75, 0.6]]),
+    }
+    own |= {name: torch.as_tensor(value) for name, value in changes.items() if name != "kind"}
+    joined = {name: torch.cat([getattr(labels, name), value]) for name, value in own.items()}
+    return replace(labels, kind=(*labels.kind, str(changes.get("kind", "Pedestrian"))), **joined)
+
+
+@pytest.fixture(scope="module")
+def crossing(street) -> Frame:
+    """The street with a person to the left of the car, and exact masks."""
+    image = street.frame.photograph.permute(1, 2, 0).numpy().copy()
+    alpha = paint_person(image, PLACE)
+    photograph = torch.from_numpy(np.rint(image * 255).astype(np.float32) / 255).permute(2, 0, 1).contiguous()
+    masks = torch.from_numpy(np.stack([street.mask.astype(np.float32), alpha]))
+    labels = label_person(street.frame.labels, alpha > 0.5)
+    return replace(street.frame, photograph=photograph, labels=labels, masks=masks)
+
+
+@pytest.fixture(scope="module")
+def scene(crossing) -> SceneIR:
+    return derender(crossing, DerenderSettings(fit=False, people=True))
+
+
+def shift(scene: SceneIR, right_m: float) -> SceneIR:
+    """The scene with its person further to the right."""
+    translation = scene.objects.translation.clone()
+    translation[1, 0] += right_m
+    return scene.with_objects(translation=translation)
+
+
+def test_people_are_background_unless_they_are_chosen(crossing, scene):
+    without = derender(crossing, DerenderSettings(fit=False))
+    assert without.objects.category.tolist() == [Category.CAR]
+    assert without.other_labels is not None
+    assert without.other_labels.kind == ("Pedestrian",)
+    assert scene.objects.category.tolist() == [Category.CAR, Category.PEDESTRIAN]
+    assert scene.objects.upright.tolist() == [False, True]
+    assert scene.other_labels is not None
+    assert scene.other_labels.kind == ()
+    assert scene.occluders == ()
+
+
+def test_the_render_is_the_photograph_to_the_level(crossing, scene):
+    image = Compositor(scene).render(scene).image
+    assert torch.equal((image * 255).round(), (crossing.photograph * 255).round())
+
+
+def test_a_moved_person_is_drawn_where_the_street_shows_it(crossing, street, scene):
+    before = street.frame.photograph.permute(1, 2, 0).numpy()
+    image = before.copy()
+    alpha = paint_person(image, (PLACE[0] + 0.7, *PLACE[1:]))
+    moved = Compositor(scene).render(shift(scene, 0.7)).image.permute(1, 2, 0).numpy()
+    window = np.s_[75:165, 90:200]
+    assert np.abs(moved - image)[window].mean() < 0.02
+    person = alpha > 0.9
+    assert np.abs(moved - image)[person].mean() < 0.04
+    left_behind = (crossing.masks[1].numpy() > 0.5) & (alpha == 0)
+    assert np.abs(moved - before)[left_behind].mean() < 0.1
+
+
+def test_clothes_change_colour_and_the_head_does_not(crossing, scene):
+    code = scene.objects.texture_code.clone()
+    code[1, 0] = 0.6
+    change = (Compositor(scene).render(scene.with_objects(texture_code=code)).image - crossing.photograph).abs()
+    person = crossing.masks[1].numpy() > 0.95
+    head = np.arange(person.shape[0])[:, None] < 88 + FOCAL * (1.65 - 1.52) / 9
+    assert float(change[:, torch.from_numpy(person & ~head)].mean()) > 0.03
+    assert float(change[:, torch.from_numpy(person & head)].mean()) < 0.003
+
+
+def test_the_gradient_of_a_persons_place_is_that_of_differences(scene):
+    exact = convert_scene(shift(scene, 0.13), torch.float64)
+    compositor = Compositor(exact, RenderSettings("reference"))
+    weights = torch.linspace(0, 1, exact.camera.width, dtype=torch.float64)
+
+    def total(right_m: torch.Tensor) -> torch.Tensor:
+        offset = torch.stack([right_m, right_m * 0, right_m * 0])
+        rows = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+        moved = exact.with_objects(translation=exact.objects.translation + rows * offset)
+        return (compositor.render(moved).image * weights).sum()
+
+    at = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(total(at), at)
+    step = torch.tensor(1e-4, dtype=torch.float64)
+    difference = float((total(step) - total(-step)) / 2e-4)
+    assert float(slope) == pytest.approx(difference, rel=0.02)
+
+
+def test_the_kernels_draw_people_as_the_reference_does(scene):
+    moved = shift(scene, 0.4)
+    images = [Compositor(scene, RenderSettings(name)).render(moved).image for name in ("warp", "reference")]
+    assert float((images[0] - images[1]).abs().max()) < 1e-3
+
+
+def test_a_saved_scene_holds_its_people(scene, tmp_path):
+    save_scene(scene, tmp_path / "scene")
+    loaded = load_scene(tmp_path / "scene")
+    assert torch.equal(loaded.objects.category, scene.objects.category)
+    moved = [Compositor(one).render(shift(one, 0.5)).image for one in (scene, loaded)]
+    assert float((moved[0] - moved[1]).abs().max()) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("reason", "changes"),
+    [
+        ("partly hidden", {"occlusion": [1]}),
+        ("cut by the border", {"truncation": [0.3]}),
+        ("cut by the border", {"boxes_xyxy": [[0.0, 84.0, 30.0, 158.0]]}),
+        ("lower than 25 px", {"boxes_xyxy": [[120.0, 100.0, 130.0, 120.0]]}),
+        ("sitting", {"kind": "Person_sitting"}),
+        ("no 3D box", {"size_lhw": [[-1.0, -1.0, -1.0]]}),
+        ("no clean outline", {"boxes_xyxy": [[100.0, 84.0, 200.0, 158.0]]}),
+    ],
+)
+def test_who_cannot_be_cut_out_whole_stays_background_with_a_reason(crossing, street, reason, changes):
+    labels = label_person(street.frame.labels, crossing.masks[1].numpy() > 0.5, **changes)
+    scene = derender(replace(crossing, labels=labels), DerenderSettings(fit=False, people=True))
+    assert scene.objects.category.tolist() == [Category.CAR]
+    assert scene.provenance["labels[1].background"] == reason
+
+
+def test_people_who_overlap_stay_background(crossing):
+    twice = label_person(crossing.labels, crossing.masks[1].numpy() > 0.5)
+    masks = torch.cat([crossing.masks, crossing.masks[1:]])
+    scene = derender(replace(crossing, labels=twice, masks=masks), DerenderSettings(fit=False, people=True))
+    assert scene.objects.category.tolist() == [Category.CAR]
+    assert {scene.provenance[f"labels[{row}].background"] for row in (1, 2)} == {"overlaps others"}
+
+
+def test_the_network_finds_the_person_in_its_box(crossing):
+    frame = replace(crossing, masks=None)
+    picture = np.rint(crossing.photograph.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    ground = torch.tensor([0.0, -1.0, 0.0, 1.65])
+    cuts, _ = people.cut_out_people(picture, frame, [0, 1], ground, "warp")
+    assert [cut.row for cut in cuts] == [1]
+    true = crossing.masks[1].numpy() > 0.5
+    assert (cuts[0].mask & true).sum() / (cuts[0].mask | true).sum() > 0.8
+
+
+def test_a_surface_is_closed_covers_its_mask_and_faces_the_camera(crossing):
+    mask = crossing.masks[1].numpy() > 0.5
+    pose = torch.tensor(PLACE), torch.tensor(0.4), torch.tensor([0.8, 1.75, 0.6])
+    placement = upright.make_placement(mask, "Pedestrian", pose, crossing.camera)
+    surface = TemplateSurface.from_mesh(placement.mesh, torch.float32)
+    assert surface.closed
+    assert bool((surface.neighbours >= 0).all())
+    assert set(placement.mesh.part.tolist()) == {Part.PAINT, Part.OTHER}
+    (outline,) = render_silhouettes([placement], crossing.camera)
+    assert not (mask & ~outline).any()
+    assert outline.sum() < 1.6 * mask.sum()
+    depth = placement.vertices()[:, 2]
+    assert 8.8 < float(depth.min()) < float(depth.max()) < 9.1
+
+
+def test_an_outline_of_its_own_follows_the_mask(crossing):
+    mask = crossing.masks[1].numpy() > 0.5
+    pose = torch.tensor(PLACE), torch.tensor(0.4), torch.tensor([0.8, 1.75, 0.6])
+    placement = upright.make_placement(mask, "Pedestrian", pose, crossing.camera, upright.ALONG_MASK)
+    (outline,) = render_silhouettes([placement], crossing.camera)
+    assert (outline & mask).sum() / (outline | mask).sum() > 0.9
+
+
+@pytest.mark.parametrize("box", [(100.0, 84.0, 130.0, 158.0), (400.0, 60.0, 440.0, 190.0)])
+def test_the_guide_fills_the_box_of_the_label(crossing, box):
+    foot = torch.tensor([(sum(box[::2]) / 2 - CENTRE) * 9 / FOCAL, 1.65, 9.0])
+    placement = upright.place_box(torch.tensor(box), foot, crossing.camera)
+    pixels = project(placement.vertices(), crossing.camera.matrix)
+    found = [*pixels.min(0).values.tolist(), *pixels.max(0).values.tolist()]
+    assert found == pytest.approx(box, abs=4.0)
