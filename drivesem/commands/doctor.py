@@ -71,7 +71,7 @@ def _version_code(module: str, also: str = "") -> str:
 
 _EGL = (
     "import os; os.environ.setdefault('PYOPENGL_PLATFORM', 'egl'); "
-    "from drivesem.failures.second_renderer.opengl import Screen; Screen(); print('draws')"
+    "from drivesem.failures.second_renderer.opengl import shared_context; shared_context(); print('draws')"
 )
 _WEIGHTS = (
     "from detectors.registry import load_detector; from scene_ir.derender import pose; "
@@ -79,7 +79,7 @@ _WEIGHTS = (
 )
 _KERNELS = "import warp; warp.config.quiet = True; warp.init(); print(warp.__version__)"
 _PRESETS = (
-    "from drivesem.config.presets import presets; found = presets(); "
+    "from drivesem.config.presets import find_presets; found = find_presets(); "
     "assert found, 'no preset is installed'; print(len(found))"
 )
 _GPU = (

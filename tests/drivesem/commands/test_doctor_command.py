@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import pkgutil
 import subprocess
 import sys
 
@@ -75,6 +77,19 @@ def test_probes_are_python() -> None:
         assert one.gives
         assert one.bring
     assert [one.name for one in FEATURES if one.needed] == ["torch", "warp", "weights"]
+
+
+def test_probes_use_names_of_ours_that_exist() -> None:
+    """A probe of a name that is gone would report a feature that works as broken."""
+    found = 0
+    for one in FEATURES:
+        for node in ast.walk(ast.parse(one.code)):
+            package = (node.module or "").partition(".")[0] if isinstance(node, ast.ImportFrom) else ""
+            if isinstance(node, ast.ImportFrom) and package in ("drivesem", "detectors", "scene_ir"):
+                for alias in node.names:
+                    pkgutil.resolve_name(f"{node.module}.{alias.name}")
+                    found += 1
+    assert found >= 4
 
 
 def test_the_command_imports_no_feature() -> None:
