@@ -441,7 +441,7 @@ def test_a_scene_that_was_not_attacked_says_so(counterexample: ds.Counterexample
     result = replace(counterexample.result, failures=(), objects=3, judged=(), found_before=(), queries=0)
     description = tags_of(replace(counterexample, result=result)._repr_html_()).text
     assert "not attacked; feasible" in description
-    assert "none of 3 vehicles is judged" in description
+    assert "none of 3 objects is judged" in description
 
 
 def test_names_are_escaped(counterexample: ds.Counterexample) -> None:

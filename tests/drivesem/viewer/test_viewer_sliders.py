@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import fields, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivesem import viewer
 from drivesem.attacks.budgets import PRESETS, parse_budget
 from drivesem.attacks.scene_edits import apply_changes
 from drivesem.attacks.space import Parameter
@@ -81,6 +83,16 @@ def test_sliders_are_coordinates_of_theta_in_physical_units(scene_sliders: Scene
         assert low - 1e-4 <= slider.low < slider.high <= high + 1e-4
         assert (high - slider.high, slider.low - low) == pytest.approx((0, 0), abs=slider.step)
     assert {slider.unit for slider in scene_sliders.sliders.values()} == {"m", "deg", "%", ""}
+
+
+def test_the_page_has_a_heading_for_each_group(scene_sliders: SceneSliders) -> None:
+    """A group without one ends the page before its first picture."""
+    script = (Path(viewer.__file__).parent / "page.js").read_text()
+    (table,) = re.findall(r"const GROUPS = \{(.*?)\};", script, re.DOTALL)
+    (order,) = re.findall(r"const ORDER = \[(.*?)\];", script, re.DOTALL)
+    headings = dict(re.findall(r'(\w+): "([^"]+)"', table))
+    assert {slider.group for slider in scene_sliders.sliders.values()} <= headings.keys()
+    assert set(headings.values()) == set(re.findall(r'"([^"]+)"', order))
 
 
 def test_as_photographed_nothing_is_found_and_all_is_drawn_by_render(
