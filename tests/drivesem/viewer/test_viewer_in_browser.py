@@ -120,7 +120,7 @@ def test_the_copied_command_draws_the_picture(
 
 def test_a_link_brings_everything_back(opened: Callable[..., Any]) -> None:
     link = {"frame": "still", "car": "1", "x": "weather.fog", "y": "objects[1].yaw", "show": "before"}
-    page = opened(**link, **{"objects[1].yaw": 5, "weather.fog": 0.25, "weather.snow": 1, "foliage.hue": "green"})
+    page = opened(**link, **{"objects[1].yaw": 5, "weather.fog": 0.25, "weather.hail": 1, "foliage.hue": "green"})
     assert state(page) == link | {"objects[1].yaw": "5", "weather.fog": "0.25"}
     assert page.locator("#before").is_visible()
     assert page.input_value("#map-x") == "weather.fog"
