@@ -114,7 +114,7 @@ def test_a_classifier_is_attacked_as_on_the_processor(tmp_path: Path) -> None:
         np.testing.assert_allclose(other["loss_trace"], mine["loss_trace"], rtol=1e-3)
 
 
-@pytest.mark.parametrize("layers", ["last", "all"])
+@pytest.mark.parametrize("layers", ["all", pytest.param("last", marks=pytest.mark.slow)])
 def test_a_classifier_learns_what_it_learns_on_the_processor(layers: str, tmp_path: Path) -> None:
     words = ["classify", "train", "--layers", layers, "--limit", "12", "--views", "forward", "--batch", "6"]
     here, there = on_both([*words, "--epochs", "2", "--json"], tmp_path)

@@ -172,7 +172,7 @@ def test_labels_of_an_added_vehicle_follow_its_visible_share(column: float, leve
     assert int(made.objects.occlusion[-1]) == level
 
 
-@pytest.mark.parametrize(("frame", "seed"), [(8, 0), (1, 1)])
+@pytest.mark.parametrize(("frame", "seed"), [(8, 0), pytest.param(1, 1, marks=pytest.mark.slow)])
 def test_positions_outside_the_picture_are_skipped(frame: int, seed: int) -> None:
     made = propose_scenes(demo_scene(0, frame), VehicleChangeSettings((VehicleChange.PARK,)), 6, seed)
     assert made

@@ -252,7 +252,7 @@ _NO_PROC = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="nee
 
 
 @_NO_PROC
-@pytest.mark.parametrize("after_s", [0.0, 0.2])
+@pytest.mark.parametrize("after_s", [0.0, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_workers_that_have_just_been_started_do_not_hear_ctrl_c(after_s: float, tmp_path: Path) -> None:
     with parent_of_workers(tmp_path) as parent:
         assert parent.stderr is not None
@@ -264,7 +264,13 @@ def test_workers_that_have_just_been_started_do_not_hear_ctrl_c(after_s: float, 
 
 
 @_NO_PROC
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGKILL,
+        *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, signal.SIGTERM)),
+    ],
+)
 def test_workers_of_a_process_that_is_stopped_end(number: signal.Signals, tmp_path: Path) -> None:
     """Soon, and without a word of their own; also where the script guards nothing by its name."""
     with parent_of_workers(tmp_path) as parent:
