@@ -1,14 +1,12 @@
-"""Converts dataclasses to JSON and CSV, and back."""
+"""Converts dataclasses to JSON, and back, and to CSV."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
-import io
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -106,48 +104,3 @@ def dump_rows(kind: type[Any], rows: Iterable[Any]) -> str:
 
 def _format_cell(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else value
-
-
-def load_rows(text: str, kind: type[T], where: str) -> Iterator[tuple[str, T]]:
-    """Yield the dataclasses of a CSV text of `dump_rows`, each with its location.
-
-    Args:
-        text: The CSV text.
-        kind: The dataclass.
-        where: Name of the file, for errors.
-
-    Raises:
-        FormatError: A line or cell is damaged.
-    """
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    hints = _hints(kind)
-    columns, known = list(hints), dict[tuple[str, str], Any]()
-    try:
-        heading = next(reader, [])
-        _require(heading == columns, where, f"columns {', '.join(columns)}", ", ".join(heading) or None)
-        for cells in reader:
-            here = f"{where}:{reader.line_num}"
-            _require(len(cells) == len(columns), here, f"{len(columns)} cells", len(cells))
-            for one in zip(columns, cells, strict=True):
-                if one not in known:  # most cells repeat
-                    hint = hints[one[0]]
-                    known[one] = from_json(hint, _parse_cell(hint, one[1]), f"{here}: {one[0]}")
-            yield here, kind(**{one[0]: known[one] for one in zip(columns, cells, strict=True)})
-    except csv.Error as error:
-        raise FormatError(f"{where}:{reader.line_num}", "CSV", error) from error
-
-
-def _parse_cell(kind: Any, cell: str) -> Any:
-    """Return a cell as JSON would hold it; if that fails, as text, which `from_json` refuses."""
-    if not cell:
-        return None
-    for plain in (kind, *get_args(kind)):
-        if plain in _CELL_PARSERS:
-            try:
-                return _CELL_PARSERS[plain](cell)
-            except (ValueError, KeyError):
-                return cell
-    return cell
-
-
-_CELL_PARSERS = {int: int, float: float, bool: {"true": True, "false": False}.__getitem__}

@@ -79,7 +79,7 @@ def test_people_stay_on_level_ground_off_the_road(walk, along, across, blocked):
 
 
 @pytest.mark.parametrize("on_grass", [False, True])
-def test_people_walk_into_nothing_green_unless_they_stand_on_it(walk, on_grass):
+def test_people_stay_out_of_bushes_unless_they_stand_on_grass(walk, on_grass):
     columns = torch.arange(621).expand(188, 621)
     green = ((columns < 310 - 360 * 3.5 / 9) if on_grass else (columns < 310 - 360 * 4.4 / 9)).float()
     scene = walk.with_environment(foliage_map=green)
