@@ -56,8 +56,9 @@ def _print(summary: RunSummary, console: Console) -> None:
         f"{format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s",
         summarise_grades(summary),
         summary.map.describe(),
+        summary.describe_rate(),
     )
-    for line in lines:
+    for line in filter(None, lines):
         console.print(line, soft_wrap=True)
     for note, frames in summary.grade_notes.items():
         console.print(f"{format_count(frames, 'frame')}: {note}", soft_wrap=True)

@@ -155,6 +155,11 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
         named = (self.target_classes or "").split(",")
         return self.people or any(name.strip() in ("Pedestrian", "Cyclist") for name in named)
 
+    @property
+    def samples_states(self) -> bool:
+        """Whether the searched states are a sample of the bounds, which no score influences."""
+        return self.method in ("random", "halton") and self.range == "bounds" and not self.early_stop
+
     def check(self) -> None:
         super().check()
         method, gradient_free = self.method, self.method in GRADIENT_FREE_METHODS

@@ -307,6 +307,48 @@ class Proportion:
         return f"{text} ({self.percent})" if self.of else text
 
 
+@dataclass(frozen=True, slots=True)
+class ClusteredShare:
+    """A share of draws that fail, where draws of one frame fail together."""
+
+    failing: int
+    """Number of draws that fail."""
+    draws: int
+    """Number of draws."""
+    frames: int
+    """Number of frames with draws."""
+    value: float
+    """Their share, in [0, 1]."""
+    low: float
+    """Lower end of the 95 % interval."""
+    high: float
+    """Upper end."""
+
+    @classmethod
+    def from_frames(cls, counts: Sequence[tuple[int, int]]) -> ClusteredShare | None:
+        """Estimate the share from failing draws and draws of each frame. None for fewer than two frames with draws.
+
+        The interval is that of Clopper and Pearson for the effective number of draws: as many independent ones as
+        would vary like the ratio between frames, less for few frames (Korn and Graubard 1998). Where no draw or each
+        one fails, frames are the draws.
+        """
+        from scipy.special import betaincinv, stdtrit  # imported on use: it takes a tenth of a second
+
+        failing, draws = np.array([pair for pair in counts if pair[1]], np.float64).reshape(-1, 2).T
+        frames, total = len(draws), float(draws.sum())
+        if frames < 2:
+            return None
+        value, effective = float(failing.sum()) / total, float(frames)
+        if 0 < value < 1:
+            variance = frames / (frames - 1) * float(((failing - value * draws) ** 2).sum()) / total**2
+            student = float(stdtrit(frames - 1, 0.5 + LEVEL / 2))
+            effective = min(value * (1 - value) / max(variance, 1e-12), total) * (_Z_95 / student) ** 2
+        hits, tail = value * effective, (1 - LEVEL) / 2
+        low = float(betaincinv(hits, effective - hits + 1, tail)) if hits > 0 else 0.0
+        high = float(betaincinv(hits + 1, effective - hits, 1 - tail)) if value < 1 else 1.0
+        return cls(int(failing.sum()), int(total), frames, value, low, high)
+
+
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:
     """95 % interval of the difference between two independent proportions, second minus first (Newcombe 1998, method
     10). Each is a pair of successes and count; raises ValueError as `wilson` does.

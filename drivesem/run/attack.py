@@ -51,7 +51,7 @@ from drivesem.run.allocation import release_freed_memory
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from drivesem.run.finished import MANIFEST, METRICS, AttackRun, build_manifest, hash_json, load_runs
 from drivesem.run.folder import FRAMES, PLAN, claim_folder, load_run_detector, load_trusted_config, result_settings
-from drivesem.run.frame import AttackedScene, grade_failures, summarise_frames, write_frame
+from drivesem.run.frame import AttackedScene, estimate_rate, grade_failures, summarise_frames, write_frame
 from drivesem.run.labels import RESULT
 from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, RunSummary, load_frame
@@ -682,6 +682,7 @@ def summarise_run(
         frames_without_vehicles=0,
         frames_failed={},
         seconds=0.0,
+        rate=estimate_rate(results) if config.samples_states else None,
         **summarise_frames(results, classes, t_star, headline),
     )
 

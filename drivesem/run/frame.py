@@ -26,7 +26,7 @@ from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.data import kitti
 from drivesem.evaluation import coco
 from drivesem.evaluation.failures import FrameFailures
-from drivesem.evaluation.resampling import Proportion
+from drivesem.evaluation.resampling import ClusteredShare, Proportion
 from drivesem.failures.certificate import CompositorRenderer, pad_visible_boxes
 from drivesem.failures.feature_cells import CellVisit
 from drivesem.failures.grades import Grade, Kind
@@ -458,6 +458,18 @@ def build_map(results: Sequence[FrameResult]) -> FailureMap:
     return FailureMap.from_frames(
         [(r.visits, {failure.index for failure in certain_losses(r)}) for r in results if r.judged]
     )
+
+
+def estimate_rate(results: Sequence[FrameResult]) -> ClusteredShare | None:
+    """Estimate how often a random state loses a vehicle that is found before, from frames that a sampling method
+    attacked to its end. The photographed state is left out.
+    """
+    counts = []
+    for result in (r for r in results if r.attacked and r.visits):
+        found = set(result.found_before)
+        visits = [visit for visit in result.visits if visit.index in found]
+        counts.append((sum(v.misses for v in visits), sum(v.passes for v in visits) - len(found)))
+    return ClusteredShare.from_frames(counts)
 
 
 def count_objects(results: Sequence[FrameResult]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from drivesem.evaluation.coco import CocoScores
-from drivesem.evaluation.resampling import Proportion
+from drivesem.evaluation.resampling import ClusteredShare, Proportion
 from drivesem.failures.feature_cells import CellVisit
 from drivesem.failures.fidelity import ObjectFidelity
 from drivesem.failures.grades import Certificate, SecondOpinion
@@ -272,6 +272,8 @@ class RunSummary:
     """Files and label rows of the data set, and what became of them; empty for generated scenes."""
     map: FailureMap = dataclasses.field(default_factory=FailureMap)
     """Which features were searched, what fails there, and what is known to hold."""
+    rate: ClusteredShare | None = None
+    """How often a random state loses an object that is found before; None where the method does not sample states."""
 
     @property
     def noun(self) -> str:
@@ -288,6 +290,14 @@ class RunSummary:
         """Attacked frames that fail with moved labels."""
         return Proportion.from_counts(self.successes_moved, self.frames_attacked)
 
+    def describe_rate(self) -> str:
+        """The rate in one line, "" without one."""
+        if self.rate is None:
+            return ""
+        share, low, high = (f"{100 * end:.2g}" for end in (self.rate.value, self.rate.low, self.rate.high))
+        draws = f"{self.rate.draws:,} {self.noun}s in random states of {self.rate.frames} frames"
+        return f"rate: {self.rate.failing:,} of {draws} missed ({share} % [{low}, {high}])"
+
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object with totals, followed by counts by class."""
         data = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -301,6 +311,7 @@ class RunSummary:
             "objects": dataclasses.asdict(self.objects),
             "missed_before": dataclasses.asdict(self.missed_before),
             "map": self.map.to_json(),
+            "rate": None if self.rate is None else dataclasses.asdict(self.rate),
             "lost_by_grade": {grade: dataclasses.asdict(share) for grade, share in self.lost_by_grade.items()},
             "benign": self.benign.to_json(),
             "rerendered": self.rerendered.to_json(),

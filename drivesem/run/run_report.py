@@ -26,7 +26,7 @@ from drivesem.failures.grades import Grade
 from drivesem.reporting.tables import format_count
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, load_attack_config
-from drivesem.run.frame import build_map, summarise_frames, targets_and_detections
+from drivesem.run.frame import build_map, estimate_rate, summarise_frames, targets_and_detections
 from drivesem.run.records import from_json
 from drivesem.run.report.html import render_report
 from drivesem.run.report.page import (
@@ -220,12 +220,12 @@ def load_reported_runs(folders: Sequence[str]) -> tuple[list[ReportedRun], int]:
     reported = []
     for run in loaded:
         results = [frame.result for frame in run.frames if frame.result.identifier in shared]
-        summary = replace(_load_summary(run.folder / METRICS), map=build_map(results))
+        config = load_attack_config(run.folder, "RUN")
+        rate = estimate_rate(results) if config.samples_states else None
+        summary = replace(_load_summary(run.folder / METRICS), map=build_map(results), rate=rate)
         if len(shared) < len(every):
             summary = _recompute_summary(summary, results)
-        reported.append(
-            _make_reported_run(run.name, run.folder, load_attack_config(run.folder, "RUN"), summary, results)
-        )
+        reported.append(_make_reported_run(run.name, run.folder, config, summary, results))
     _check_photographs(reported)
     return reported, len(every) - len(shared)
 

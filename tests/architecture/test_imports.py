@@ -93,7 +93,7 @@ RULES = (
     Rule(
         "drivesem.evaluation",
         ("detectors.types", "detectors.boxes"),
-        ("torch", "numpy", "pycocotools", "ultrafast_pycocotools"),
+        ("torch", "numpy", "scipy", "pycocotools", "ultrafast_pycocotools"),
         never=("scene_ir", "drivesem.attacks"),
     ),
     Rule("drivesem.failures", ("scene_ir", "detectors", *(f"drivesem.{part}" for part in _BELOW_FAILURES)), None),

@@ -7,6 +7,7 @@ from scipy.stats import binomtest
 from drivesem.evaluation.curves import ClassMatches
 from drivesem.evaluation.kitti import evaluate
 from drivesem.evaluation.resampling import (
+    ClusteredShare,
     NamedMetric,
     Proportion,
     WeightedAveragePrecision,
@@ -169,3 +170,35 @@ def test_a_difference_without_its_test_is_the_same() -> None:
 )
 def test_a_proportion_has_its_interval(count: int, of: int, text: str) -> None:
     assert Proportion.from_counts(count, of).format("cars") == text
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.2])
+def test_a_clustered_share_s_interval_holds_the_rate_as_often_as_documented(rate: float) -> None:
+    rng, held = np.random.default_rng(0), 0
+    for _ in range(400):
+        chances, draws = rng.beta(4 * rate, 4 * (1 - rate), 60), 16 * rng.integers(1, 6, 60)
+        failing = rng.binomial(draws, chances)
+        share = ClusteredShare.from_frames(list(zip(failing.tolist(), draws.tolist(), strict=True)))
+        assert share is not None
+        assert share.low < share.value < share.high
+        held += share.low <= rate <= share.high
+    assert 0.91 <= held / 400 <= 0.98
+
+
+def test_clustered_shares_at_the_ends() -> None:
+    none = ClusteredShare.from_frames([(0, 16)] * 30 + [(0, 0)])
+    assert none is not None
+    assert (none.failing, none.draws, none.frames, none.value, none.low) == (0, 480, 30, 0, 0)
+    assert none.high == pytest.approx(1 - 0.025 ** (1 / 30))  # no frame of 30
+    all_fail = ClusteredShare.from_frames([(16, 16)] * 30)
+    assert all_fail is not None
+    assert (all_fail.high, all_fail.low) == (1, pytest.approx(0.025 ** (1 / 30)))
+    assert ClusteredShare.from_frames([(3, 16), (0, 0)]) is None
+
+
+def test_frames_that_fail_together_make_a_clustered_share_less_certain() -> None:
+    alike, together = (ClusteredShare.from_frames(c) for c in ([(4, 16)] * 20, [(16, 16)] * 5 + [(0, 16)] * 15))
+    assert alike is not None
+    assert together is not None
+    assert alike.value == together.value == 0.25
+    assert together.high - together.low > 3 * (alike.high - alike.low)
