@@ -35,7 +35,14 @@ def view_command(config: ViewConfig) -> int:
 
 def _create_server(frames: ViewerFrames, port: int | None) -> Server:
     """Create the server at the given port, or at the first free one."""
-    viewer = Viewer(frames.title, frames.frames, frames.detector, frames.budget, frames.t_star)
+    viewer = Viewer(
+        frames.title,
+        frames.frames,
+        frames.detector,
+        frames.budget,
+        frames.t_star,
+        failure_map=frames.failure_map,
+    )
     ports = range(_PORT, _PORT + _MAX_TRIES) if port is None else [port]
     for number in ports:
         try:

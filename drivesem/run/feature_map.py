@@ -22,6 +22,8 @@ CLEAR_BELOW = 0.1
 CellState = Literal["failing", "clear", "missed", "unknown"]
 """failing: certain failures; clear: none, and a bound under `CLEAR_BELOW`; missed: misses that are not certain;
 unknown: no miss, but too few frames."""
+SearchedFrame = tuple[str, Sequence[CellVisit], Collection[int | None]]
+"""Name of a frame, its visits, and the objects that are lost for certain in its counterexample."""
 CELLS: tuple[Cell, ...] = tuple(
     (size, contrast, across, light)
     for size, contrast, across, light in itertools.product(
@@ -51,6 +53,8 @@ class MapCell:
     """One-sided 95 % upper limit on the share of such frames, in [0, 1]."""
     certain: int
     """Objects that are lost for certain in it."""
+    failures: tuple[tuple[str, int], ...] = ()
+    """Frame and number of each of these objects."""
 
     def describe(self) -> str:
         """Such as `under 40 px, low contrast, left, dark: 3 certain of 12 objects`."""
@@ -81,12 +85,10 @@ class FailureMap:
     """Frames left out, as the version that attacked them has no record of the search."""
 
     @classmethod
-    def from_frames(cls, frames: Sequence[tuple[Sequence[CellVisit], Collection[int | None]]]) -> FailureMap:
-        """Build the map of a run's frames with judged vehicles: the visits of each frame, and the objects that are
-        lost for certain in its counterexample.
-        """
-        known = [(visits, certain) for visits, certain in frames if visits]
-        by_cell = {cell: _map_cell(cell, known) for cell in sorted({v.cell for vs, _ in known for v in vs})}
+    def from_frames(cls, frames: Sequence[SearchedFrame]) -> FailureMap:
+        """Build the map of a run's frames with judged vehicles."""
+        known = [frame for frame in frames if frame[1]]
+        by_cell = {cell: _map_cell(cell, known) for cell in sorted({v.cell for _, vs, _ in known for v in vs})}
         states = [cell.state for cell in by_cell.values()]
         counts = (states.count("failing"), states.count("clear"), len(frames) - len(known))
         return cls(tuple(by_cell.values()), len(by_cell), *counts)
@@ -131,11 +133,11 @@ def upper_limit(found: int, count: int) -> float:
     return 1.0 if found >= count else float(betaincinv(found + 1, count - found, LEVEL))
 
 
-def _map_cell(cell: Cell, frames: Sequence[tuple[Sequence[CellVisit], Collection[int | None]]]) -> MapCell:
-    here = [([v for v in visits if v.cell == cell], certain) for visits, certain in frames]
-    here = [(visits, certain) for visits, certain in here if visits]
-    missed = sum(any(visit.misses for visit in visits) for visits, _ in here)
-    lost = sum(visit.final and visit.index in certain for visits, certain in here for visit in visits)
+def _map_cell(cell: Cell, frames: Sequence[SearchedFrame]) -> MapCell:
+    here = [(name, [v for v in visits if v.cell == cell], certain) for name, visits, certain in frames]
+    here = [frame for frame in here if frame[1]]
+    missed = sum(any(visit.misses for visit in visits) for _, visits, _ in here)
+    lost = sorted((name, v.index) for name, vs, certain in here for v in vs if v.final and v.index in certain)
     limit = upper_limit(missed, len(here))
     state: CellState = "missed" if missed else "unknown"
     if lost or limit < CLEAR_BELOW:
@@ -143,10 +145,11 @@ def _map_cell(cell: Cell, frames: Sequence[tuple[Sequence[CellVisit], Collection
     return MapCell(
         where={name: LEVEL_NAMES[name][level] for name, level in zip(CELL_EDGES, cell, strict=True)},
         state=state,
-        objects=sum(len(visits) for visits, _ in here),
+        objects=sum(len(visits) for _, visits, _ in here),
         frames=len(here),
-        passes=sum(visit.passes for visits, _ in here for visit in visits),
+        passes=sum(visit.passes for _, visits, _ in here for visit in visits),
         frames_missed=missed,
         missed_below=round(limit, 4),
-        certain=lost,
+        certain=len(lost),
+        failures=tuple(lost),
     )

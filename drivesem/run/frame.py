@@ -456,7 +456,7 @@ def count_grades(results: Sequence[FrameResult]) -> dict[str, Any]:
 def build_map(results: Sequence[FrameResult]) -> FailureMap:
     """Build the map of frames with judged vehicles."""
     return FailureMap.from_frames(
-        [(r.visits, {failure.index for failure in certain_losses(r)}) for r in results if r.judged]
+        [(r.identifier, r.visits, {failure.index for failure in certain_losses(r)}) for r in results if r.judged]
     )
 
 

@@ -592,4 +592,6 @@ document.addEventListener("visibilitychange", () => { if (!document.hidden && fr
   const {frame: name, params} = readLink();
   await load(name, params);
   drawRamp();
+  $("searched").innerHTML = await (await request("/searched")).text();  // names in it are escaped
+  $("searched-part").classList.toggle("hidden", $("searched").childElementCount === 0);
 })().catch(complain);

@@ -31,8 +31,11 @@ from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.config.commands import ViewConfig
 from drivesem.config.errors import UsageError
 from drivesem.reporting.tables import format_count
+from drivesem.reporting.web import render_page
+from drivesem.run.feature_map import FailureMap
 from drivesem.run.finished import load_runs
 from drivesem.run.folder import CONFIG, load_run_detector, load_trusted_config
+from drivesem.run.frame import build_map
 from drivesem.run.results import FrameResult
 from drivesem.scenes.sources import find_scene_folders
 from drivesem.viewer.scene import InteractiveScene
@@ -49,8 +52,9 @@ POLICY = (
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 """Content security policy of the page."""
+_HTML = "text/html; charset=utf-8"
 _ASSETS = {
-    "/": ("drivesem.viewer", "page.html", "text/html; charset=utf-8"),
+    "/": ("drivesem.viewer", "page.html", _HTML),
     "/page.css": ("drivesem.viewer", "page.css", "text/css; charset=utf-8"),
     "/page.js": ("drivesem.viewer", "page.js", "text/javascript; charset=utf-8"),
     "/report.css": ("drivesem.reporting", "style.css", "text/css; charset=utf-8"),
@@ -109,6 +113,7 @@ class Viewer:
         budget: Budget,
         t_star: float | None = None,
         grid: int = GRID,
+        failure_map: FailureMap | None = None,
     ) -> None:
         """Create a viewer.
 
@@ -119,8 +124,9 @@ class Viewer:
             budget: Range of the sliders.
             t_star: Score from which a detection counts; None: the detector's own.
             grid: Cells of the failure map per axis.
+            failure_map: What the run searched; None if the frames are of no run.
         """
-        self.grid = grid
+        self.grid, self.failure_map = grid, failure_map or FailureMap()
         self.title, self.frames, self.detector = title, frames, detector
         self._budget, self._t_star = budget, t_star
         self._scenes: OrderedDict[str, InteractiveScene] = OrderedDict()
@@ -134,6 +140,12 @@ class Viewer:
         """Title, detector and frames, as JSON values."""
         frames = [{"name": name, "words": frame.words} for name, frame in self.frames.items()]
         return {"title": self.title, "detector": self.detector.name, "grid": self.grid, "frames": frames}
+
+    def searched(self) -> str:
+        """Table of what the run searched, as HTML; "" if the frames are of no run."""
+        if not self.failure_map.searched:
+            return ""
+        return render_page("drivesem.run.report:map.html", map=self.failure_map, links=True)
 
     def facts(self, name: str) -> dict[str, Any]:
         """Sliders and vehicles of a frame, as JSON values."""
@@ -428,6 +440,7 @@ def _json(value: object) -> tuple[bytes, str]:
 
 _ROUTES: Mapping[str, Callable[[Viewer, _Query], tuple[bytes, str]]] = {
     "/overview": lambda viewer, _: _json(viewer.overview()),
+    "/searched": lambda viewer, _: (viewer.searched().encode(), _HTML),
     "/frame": lambda viewer, q: _json(viewer.facts(q.frame)),
     "/photograph": lambda viewer, q: (viewer.photograph(q.frame), _JPEG),
     "/street": lambda viewer, q: (viewer.street(q.frame), _PNG),
@@ -456,6 +469,8 @@ class ViewerFrames:
     """Range of the sliders."""
     t_star: float | None
     """Score from which a detection counts; None: the detector's own."""
+    failure_map: FailureMap | None = None
+    """What the run searched; None if the frames are of no run."""
 
 
 def open_viewer_frames(config: ViewConfig) -> ViewerFrames:
@@ -464,13 +479,14 @@ def open_viewer_frames(config: ViewConfig) -> ViewerFrames:
     Raises UsageError for a path or detector that cannot be used, FormatError for a damaged file.
     """
     path = Path(config.scene)
-    budget, t_star = parse_budget(config.budget), config.t_star
+    budget, t_star, failure_map = parse_budget(config.budget), config.t_star, None
     if _is_run(path):
         (run,) = load_runs([config.scene], setting=_SETTING)
         frames = {
             frame.result.identifier: ViewerFrame(frame.folder / "scene", _summarize_frame(frame.result))
             for frame in run.frames
         }
+        failure_map = build_map([frame.result for frame in run.frames])
         attack = load_trusted_config(run.folder, config.trust, _SETTING)
         t_star = attack.t_star if t_star is None else t_star
         own = config.detector is None
@@ -485,7 +501,7 @@ def open_viewer_frames(config: ViewConfig) -> ViewerFrames:
     first = config.frame or next((name for name, frame in frames.items() if count_objects(frame.folder)), None)
     if first is not None:
         frames = {first: frames[first], **frames}
-    return ViewerFrames(path.resolve().name, frames, detector, budget, t_star)
+    return ViewerFrames(path.resolve().name, frames, detector, budget, t_star, failure_map)
 
 
 def _is_run(path: Path) -> bool:

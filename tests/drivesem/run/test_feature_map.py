@@ -16,10 +16,10 @@ FAR: Cell = (0, 0, 0, 0)
 
 def frame(
     *visits: tuple[int, Cell, int], final: int | None = None, certain: Sequence[int] = ()
-) -> tuple[list[CellVisit], set[int | None]]:
+) -> tuple[str, list[CellVisit], set[int | None]]:
     """Visits of object, cell and misses, with two passes each; `final`: the object that ends in its cell."""
     found = [CellVisit(index, cell, 2, misses, final=index == final) for index, cell, misses in visits]
-    return found, set(certain)
+    return "f", found, set(certain)
 
 
 def test_a_cell_is_clear_from_enough_frames_and_not_from_objects_of_few() -> None:
@@ -36,10 +36,11 @@ def test_a_cell_is_clear_from_enough_frames_and_not_from_objects_of_few() -> Non
 
 def test_states_and_totals() -> None:
     moved = [CellVisit(0, FAR, 2, 1, final=True), CellVisit(0, NEAR, 2, 0)]
-    frames = [(moved, {0}), frame((1, NEAR, 1), (2, NEAR, 0), certain=[2]), frame(), frame((0, NEAR, 0))]
+    frames = [("moved", moved, {0}), frame((1, NEAR, 1), (2, NEAR, 0), certain=[2]), frame(), frame((0, NEAR, 0))]
     found = FailureMap.from_frames(frames)
     far, near = found.cells
     assert (far.state, far.certain, far.objects, far.frames_missed) == ("failing", 1, 1, 1)
+    assert (far.failures, near.failures) == ((("moved", 0),), ())
     assert (near.state, near.certain, near.objects) == ("missed", 0, 4)
     assert (near.frames, near.frames_missed) == (3, 1)
     assert (found.searched, found.failing, found.clear, found.frames_without_record) == (2, 1, 0, 1)

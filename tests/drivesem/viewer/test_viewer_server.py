@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 
 from drivesem.attacks.budgets import PRESETS
+from drivesem.failures.feature_cells import CellVisit
+from drivesem.run.feature_map import FailureMap
 from drivesem.viewer.scene import InteractiveScene
 from drivesem.viewer.server import HOST, POLICY, Server, Viewer, ViewerFrame
 from tests.drivesem.viewer.conftest import GRID, Stubborn
@@ -113,6 +115,19 @@ def test_a_state_as_picture_and_as_what_is_found(server: Server, viewer: Viewer)
     assert one == found["cars"][0]
     assert json.loads(get(server, query("/notes", **values)).body) == []
     assert get(server, query("/street", **STILL)).kind == "image/png"
+
+
+def test_the_map_of_the_run_links_to_what_is_lost(still: Path, stubborn: Stubborn, server: Server) -> None:
+    assert get(server, "/searched").body == b""
+    visit = CellVisit(3, (0, 0, 0, 0), 2, 1, final=True)
+    searched = FailureMap.from_frames([("<b>a&b</b>", [visit], {3})])
+    with closing(
+        Viewer("t", {"still": ViewerFrame(still)}, stubborn, PRESETS["street"], failure_map=searched)
+    ) as made:
+        table = made.searched()
+    assert "1 certain of 1 object" in table
+    assert 'href="#frame=%3Cb%3Ea%26b%3C%2Fb%3E&amp;car=3"' in table
+    assert "<b>a" not in table
 
 
 @pytest.mark.parametrize(
