@@ -226,9 +226,9 @@ def write_run_summary(
 
 def _check_detections(worker: AttackWorker, names: Sequence[str]) -> None:
     """Raise UsageError for a detector that finds no object in the first photographs: it has nothing to lose."""
-    config, targets = worker.config, TargetSelection.from_options(None, worker.config.target_classes)
+    config = worker.config
     known = EvaluatedClasses.from_detector(worker.detector).names
-    classes = targets.classes_of(known) if config.moves_people else (HEADLINE,)
+    classes = known if config.moves_people else (HEADLINE,)
     t_star = resolve_t_star(worker.detector, config.t_star)
     if len(names) < 2:
         return

@@ -285,7 +285,7 @@ class RunSummary:
     """Run time."""
     data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Files and label rows of the data set, and what became of them; empty for generated scenes."""
-    by_class: Mapping[str, ClassSummary] = dataclasses.field(default_factory=dict)
+    by_class: dict[str, ClassSummary] = dataclasses.field(default_factory=dict)
     """Classes with judged objects or failures."""
     map: FailureMap = dataclasses.field(default_factory=FailureMap)
     """Which features were searched, what fails there, and what is known to hold."""
