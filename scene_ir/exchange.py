@@ -167,9 +167,7 @@ def relocate_person(scene: SceneIR, row: int, place: Tensor, vehicle: int) -> Sc
     foreground = Crop(drawn.to(scene.background).clamp(0.0, 1.0).contiguous(), x0, y0)
     alone = replace(moved.objects, source=(), **{n: getattr(moved.objects, n)[row : row + 1] for n in _TENSORS})
     shadow = _cast_shadow(scene, alone, [old, *objects.source])
-    source = replace(
-        old, translation=place, yaw=yaw[row], foreground=foreground, shadow=shadow, region=None
-    )
+    source = replace(old, translation=place, yaw=yaw[row], foreground=foreground, shadow=shadow, region=None)
     sources = list(complete_uncovered_sources(scene, {row}))
     sources[row] = source
     index = objects.mesh_index.clone()

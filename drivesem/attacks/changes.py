@@ -90,7 +90,7 @@ class VehicleChangeSettings:
 
 
 def parse_vehicle_changes(text: str) -> tuple[VehicleChange, ...]:
-    """Kinds from "leave,park,swap,load". Raises FormatError naming the unknown one and the known ones."""
+    """Kinds from "leave,park,swap,load,emerge". Raises FormatError naming the unknown one and the known ones."""
     names = [part.strip() for part in text.split(",")]
     for name in names:
         if name not in list(VehicleChange) or names.count(name) > 1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,8 @@ from drivesem.data.kitti import read_labels
 from drivesem.run import attack as run_attack
 from drivesem.run import detection_cache
 from drivesem.run import folder as run_folder
-from tests.drivesem.invoke import run_json
+from drivesem.run.results import load_frame
+from tests.drivesem.invoke import refusal, run_json
 
 ATTACK = ("attack", "--detector", "any", "--dataset", "kitti", "--people", "--no-fit", "--params", "color")
 QUICK = ("--method", "random", "--queries", "1", "--nuisances", "off", "--no-confirm", "--second-detector", "off")
@@ -84,6 +86,30 @@ def test_gate_and_export_know_the_person(run: Path, tmp_path: Path) -> None:
     run_json("export", run, "--to", "kitti", "--out", tmp_path / "kitti")
     (labels,) = (tmp_path / "kitti").rglob("label_2/*.txt")
     assert "Pedestrian" in labels.read_text()
+
+
+@pytest.mark.slow
+def test_a_person_emerges_from_behind_a_vehicle(
+    run: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The proposal is taken, whatever its margins; its person stays judged, and the run agrees with its files."""
+    worse = count(0, -1)
+    monkeypatch.setattr(run_attack, "margin_objective", lambda *_: next(worse))
+    words = ("--params", "translate", "--method", "climb", "--budget", "street", "--passes", "36", "--no-confirm")
+    run_json(
+        *ATTACK[:-2], *words, "--changes", "emerge", "--workers", "1", "--root", root, "--out", tmp_path / "run"
+    )
+    result = load_frame(tmp_path / "run" / "frames" / "000000" / "result.json")
+    assert result.change == "objects[1] stands behind objects[0]"
+    assert result.violations == ()
+    assert 1 in result.judged
+    assert not result.targets_moved[1].ignore
+    assert run_json("verify", tmp_path / "run", "--workers", "1")["differences"] == []
+
+
+def test_nobody_emerges_without_people(tmp_path: Path) -> None:
+    words = ("attack", "--method", "climb", "--budget", "street", "--changes", "emerge", "--out", tmp_path / "run")
+    assert refusal(*words) == "--changes: expected no emerge without --people, found emerge"
 
 
 @pytest.mark.slow
