@@ -567,8 +567,8 @@ def _road_violations(
         green = base.environment.foliage_map.numpy().astype(np.float64)
         on_grass = (_road_share(base, green, old, at_feet=True) or 0.0) >= 0.5
         sure = ((road - 0.5) / 0.3).clip(0, 1)
-        pavement = _level_ground(base) * (1 - sure) * (1.0 if on_grass else 1 - green)
-        road = np.maximum(pavement, road) if steps_onto_road else pavement
+        level = _level_ground(base) * (1.0 if on_grass else 1 - green)
+        road = np.maximum(level, road) if steps_onto_road else level * (1 - sure)
     before, after = (_road_share(base, road, car) for car in (old, new))
     if before is None or after is None or after >= before - ROAD_LOSS - ROAD_TOLERANCE:
         return []
