@@ -7,6 +7,7 @@ checked before anything is allocated.
 from __future__ import annotations
 
 import codecs
+import errno
 import filecmp
 import gzip
 import hashlib
@@ -209,8 +210,8 @@ def _replace_folder(temporary: Path, folder: Path) -> None:
         try:
             os.replace(temporary, folder)
             done = True
-        except OSError:
-            if not os.path.lexists(folder):  # and no other process came between
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # no other process came between
                 if os.path.lexists(old):
                     os.replace(old, folder)
                 raise

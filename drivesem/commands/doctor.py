@@ -169,6 +169,9 @@ FEATURES = (
         "pyarrow", "Parquet in export --to tables", "pip install 'drivesem[tables]'", _version_code("pyarrow")
     ),
     OptionalFeature(
+        "scikit-learn", "attack --method learn", "pip install 'drivesem[learn]'", _version_code("sklearn")
+    ),
+    OptionalFeature(
         "ultrafast-pycocotools",
         "COCO metrics, several times faster",
         "pip install 'drivesem[eval]'",

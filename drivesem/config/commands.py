@@ -72,7 +72,9 @@ QUERY_METHODS = (*GRADIENT_FREE_METHODS, "scw")
 """Search methods that end after --queries."""
 MIN_PASSES = 24
 """The fewest --passes: with fewer, searches end with their first samples."""
-SearchMethod = Literal["si-fgsm", "apgd", "fgsm", "sgd", "scw", "random", "halton", "cma-es", "corners", "climb"]
+SearchMethod = Literal[
+    "si-fgsm", "apgd", "fgsm", "sgd", "scw", "random", "halton", "cma-es", "corners", "climb", "learn"
+]
 """Methods that search for failures; a placebo does not."""
 
 _DEFAULT_NETWORK = "squeezenet"
@@ -107,9 +109,9 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     params: str | None = None
     """Parameters, with commas, not a combo: color, weather, foliage, translate, rotate, mesh, size, sun, lamps."""
     method: Literal[SearchMethod, "placebo"] = "si-fgsm"
-    """Search method; climb and corners look for failures that hold; placebo makes one random edit (--like)."""
+    """Search method; climb, corners and learn look for failures that hold; placebo makes a random edit (--like)."""
     passes: Annotated[Count, at_least(MIN_PASSES, "which the search needs")] | None = None
-    """Detector passes per frame (a gradient counts as 3); climb and corners take 90 by default."""
+    """Detector passes per frame (a gradient counts as 3); climb, corners and learn take 90 by default."""
     queries: Annotated[Count, OnlyWith("method", QUERY_METHODS)] | None = None
     """Query budget: gradients for scw, evaluated renders for gradient-free methods (default: 64)."""
     step_form: Annotated[Literal["raw", "l2"], OnlyWith("method", ("sgd",))] = "l2"
@@ -132,7 +134,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     """Stop a frame at its first success."""
     grade: bool = True
     """Compute certificates; without them every failure has the grade threshold."""
-    changes: Annotated[str, OnlyWith("method", ("climb", "corners"))] | None = None
+    changes: Annotated[str, OnlyWith("method", ("climb", "corners", "learn"))] | None = None
     """Changes of objects with --budget street: leave, park, swap, load, emerge (people), with commas."""
     mesh: str | None = None
     """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY in metres (default: the templates)."""
@@ -161,7 +163,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
         refuse(self.range != "bounds" and not gradient_free, "--range", free, f"--method {method}")
         exact = f"float32 with {method}, which takes no gradient"
         refuse(gradient_free and self.precision != "float32", "--precision", exact, self.precision)
-        whole = self.early_stop and method in ("fgsm", "placebo", "corners", "climb")
+        whole = self.early_stop and method in ("fgsm", "placebo", "corners", "climb", "learn")
         refuse(whole, "--early-stop", "a method that can end at its first success", f"--method {method}")
         refuse(None not in (self.passes, self.queries), "--queries", "no --passes", f"--passes {self.passes}")
         street = self.budget.split(",")[0] == "street"

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from detectors.base import Candidates, Detector, predict
 from detectors.incremental.reference import ReferencePass
+from detectors.types import Targets
 from drivesem.attacks import losses
 from drivesem.attacks.labels import visible_boxes
 from drivesem.attacks.methods.base import GRADIENT_PASSES
@@ -19,6 +20,7 @@ from drivesem.failures import margins as margin
 from drivesem.failures.certificate import pad_visible_boxes
 from drivesem.failures.kinds import LabelledDetections, match_detections
 from drivesem.failures.nuisances import Nuisances, NuisanceSample
+from drivesem.failures.search_log import ObjectPatches
 from scene_ir.types import Render, SceneIR
 
 SHARPNESS = 4.0
@@ -111,6 +113,20 @@ class NuisanceMarginOracle:
         """
         return self._compute_margins(theta, number, SHARPNESS)
 
+    @torch.no_grad()
+    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        """Render theta (D,) in one sample, without a detector pass.
+
+        Returns:
+            Rows (K,) of the objects that count, and their features (K, F), `search_log.OBJECT_FEATURES`.
+        """
+        space, sample = self.objective.space, self.sample(number)
+        scene = sample.perturb_scene(space.apply(space.scene, theta))
+        render = self.objective.compositor.render(scene)
+        targets, rows = self._counted_targets(scene, render)
+        boxes_xyxy = sample.transform_boxes(targets.boxes_xyxy[rows])
+        return rows, ObjectPatches.from_image(sample.degrade_image(render.image), boxes_xyxy).features()
+
     def clear_cache(self) -> None:
         """Drop cached samples and layers; they are recomputed when needed."""
         self._samples.clear()
@@ -135,7 +151,8 @@ class NuisanceMarginOracle:
         candidates = self._find_candidates(image, number, render)
         rows, boxes_xyxy, margins = self._object_margins(candidates, sample, scene, render, sharpness)
         passes = 1 if sharpness is None else GRADIENT_PASSES
-        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, margins.detach() < 0, passes)
+        values = margins.detach()
+        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, values < 0, passes, values)
         everywhere = margins.new_full((len(self.counted_objects),), torch.inf)
         return everywhere.index_put((rows.to(margins.device),), margins)
 
@@ -173,18 +190,21 @@ class NuisanceMarginOracle:
         sharpness: float | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Rows (K,), boxes (K, 4) px and margins (K,) of the objects that count here and in the benign image."""
-        objective, count = self.objective, len(self.counted_objects)
         with torch.no_grad():
             detached = replace(render, image=render.image.detach())
-            moved = objective.labeller.moved(scene, detached).targets
-            targets = objective.classes.map_targets(moved)
-            if self.differentiable:
-                targets = objective.classes.to_detector_targets(targets)
-            counts = self.counted_objects & ~targets.ignore[:count].to(self.counted_objects.device)
-            rows = counts.nonzero()[:, 0]
+            targets, rows = self._counted_targets(scene, detached)
             boxes_xyxy, visible = sample.transform_boxes(targets.boxes_xyxy[rows]), visible_boxes(detached)[rows]
             is_visible = (visible[:, 2:] > visible[:, :2]).all(1, keepdim=True)
             visible = torch.where(is_visible, sample.transform_boxes(visible), visible)
         labels = targets.labels[rows]
-        margins = margin.object_margins(candidates, boxes_xyxy, labels, visible, objective.t_star, sharpness)
+        margins = margin.object_margins(candidates, boxes_xyxy, labels, visible, self.objective.t_star, sharpness)
         return rows, boxes_xyxy, margins
+
+    def _counted_targets(self, scene: SceneIR, render: Render) -> tuple[Targets, Tensor]:
+        """Labels of a state, and the rows (K,) of the objects that count in it and in the benign image."""
+        classes, count = self.objective.classes, len(self.counted_objects)
+        targets = classes.map_targets(self.objective.labeller.moved(scene, render).targets)
+        if self.differentiable:
+            targets = classes.to_detector_targets(targets)
+        counts = self.counted_objects & ~targets.ignore[:count].to(self.counted_objects.device)
+        return targets, counts.nonzero()[:, 0]

@@ -14,18 +14,21 @@ from detectors import boxes
 from detectors.planted import compute_features
 from drivesem.failures.feature_cells import CELL_EDGES, Cell, CellVisit
 
+OBJECT_FEATURES: tuple[str, ...] = ("height_px", "aspect", "across", "lightness", "contrast", "light")
+"""Features of an object as drawn: those of `detectors.planted.FEATURES`, and the mean of the picture."""
 _GRID = 16
-"""Contrast is that of so many pixels either way in a box, which takes the same time for near and far cars."""
+"""Lightness and contrast are those of so many pixels either way in a box, which takes the same time for near and far
+cars."""
 _LIGHT_STEP = 4
 """Every fourth pixel either way gives the picture's light."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectPatches:
-    """What cells need of the objects in one picture. Pixels stay on its device, as every transfer would wait for it."""
+    """What features need of the objects in one picture. Pixels stay on its device: every transfer would wait for it."""
 
     box_features: Tensor
-    """(K, 2): height in px, and place across in [0, 1]."""
+    """(K, 3): height in px, width by height, and place across in [0, 1]."""
     pixels: Tensor
     """(K, 3, G, G) RGB, a grid of pixels of each box."""
     light: Tensor
@@ -43,29 +46,62 @@ class ObjectPatches:
         grid = 2 * grid / torch.tensor([max(width - 1, 1), max(height - 1, 1)]) - 1
         source = image[None].expand(len(grid), -1, -1, -1)
         pixels = F.grid_sample(source, grid.to(image), mode="nearest", padding_mode="border", align_corners=True)
-        box_features = torch.stack([bottom - top, (left + right) / (2 * width)], 1)
+        tall = bottom - top
+        box_features = torch.stack([tall, (right - left) / tall.clamp_min(1), (left + right) / (2 * width)], 1)
         return cls(box_features, pixels, image[:, ::_LIGHT_STEP, ::_LIGHT_STEP].mean().expand(len(grid)))
+
+    def features(self) -> Tensor:
+        """(K, F) float64 on the CPU, in the order of `OBJECT_FEATURES`."""
+        whole = torch.tensor([0.0, 0, _GRID - 1, _GRID - 1]).expand(len(self.pixels), 1, 4)
+        of_pixels = compute_features(self.pixels.cpu(), whole, ("lightness", "contrast"))[..., 0]
+        return torch.cat([self.box_features.double(), of_pixels.double().T, self.light.cpu().double()[:, None]], 1)
 
     def cells(self) -> list[Cell]:
         """The cells of the K objects."""
-        whole = torch.tensor([0.0, 0, _GRID - 1, _GRID - 1]).expand(len(self.pixels), 1, 4)
-        (contrast,) = compute_features(self.pixels.cpu(), whole, ("contrast",))[..., 0]
-        height, across = self.box_features.T
-        columns = zip(CELL_EDGES.values(), (height, contrast, across, self.light.cpu()), strict=True)
-        levels = [np.searchsorted(edges, values.double().numpy(), side="right") for edges, values in columns]
+        columns = dict(zip(OBJECT_FEATURES, self.features().T.numpy(), strict=True))
+        levels = [np.searchsorted(edges, columns[name], side="right") for name, edges in CELL_EDGES.items()]
         return [(size, low, place, light) for size, low, place, light in np.stack(levels, 1).tolist()]
+
+
+def _join(patches: Sequence[ObjectPatches]) -> ObjectPatches:
+    return ObjectPatches(
+        torch.cat([p.box_features for p in patches]),
+        torch.cat([p.pixels for p in patches]),
+        torch.cat([p.light for p in patches]),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """An evaluated state."""
+
+    objects: Tensor
+    """(K,) int64."""
+    patches: ObjectPatches
+    """What features need of them."""
+    missed: Tensor
+    """(K,) bool."""
+    passes: int
+    """Detector passes."""
+    margins: Tensor | None
+    """(K,) logits."""
 
 
 @dataclass
 class SearchLog:
     """Evaluated states of a search."""
 
-    _states: list[tuple[Tensor, ObjectPatches, Tensor, int]] = field(
-        default_factory=list[tuple[Tensor, ObjectPatches, Tensor, int]]
-    )
-    """Objects (K,), what cells need of them, whether each is missed (K,), and passes."""
+    _states: list[_State] = field(default_factory=list[_State])
 
-    def record(self, image: Tensor, objects: Tensor, boxes_xyxy: Tensor, missed: Tensor, passes: int) -> None:
+    def record(
+        self,
+        image: Tensor,
+        objects: Tensor,
+        boxes_xyxy: Tensor,
+        missed: Tensor,
+        passes: int,
+        margins: Tensor | None = None,
+    ) -> None:
         """Add an evaluated state.
 
         Args:
@@ -74,9 +110,20 @@ class SearchLog:
             boxes_xyxy: (K, 4) px, their labels.
             missed: (K,) bool.
             passes: Detector passes that the state took.
+            margins: (K,) logits, where they are known.
         """
         if len(objects):
-            self._states.append((objects, ObjectPatches.from_image(image, boxes_xyxy), missed, passes))
+            patches = ObjectPatches.from_image(image, boxes_xyxy)
+            self._states.append(_State(objects, patches, missed, passes, margins))
+
+    def margin_rows(self) -> np.ndarray:
+        """(R, F + 1) float32: features of each object in each state with margins, and its margin."""
+        states = [state for state in self._states if state.margins is not None]
+        if not states:
+            return np.empty((0, len(OBJECT_FEATURES) + 1), np.float32)
+        margins = torch.cat([state.margins.double().cpu() for state in states if state.margins is not None])
+        features = _join([state.patches for state in states]).features()
+        return torch.cat([features, margins[:, None]], 1).float().numpy()
 
     def visits(self, counterexample: Sequence[Cell]) -> tuple[CellVisit, ...]:
         """All visits, by object and cell.
@@ -86,15 +133,11 @@ class SearchLog:
         """
         if not self._states:
             return ()
-        objects, patches, missed, passes = zip(*self._states, strict=True)
-        cells = ObjectPatches(
-            torch.cat([p.box_features for p in patches]),
-            torch.cat([p.pixels for p in patches]),
-            torch.cat([p.light for p in patches]),
-        ).cells()
-        costs = [cost for cost, own in zip(passes, objects, strict=True) for _ in own]
+        cells = _join([state.patches for state in self._states]).cells()
+        costs = [state.passes for state in self._states for _ in state.objects]
+        objects, missed = (torch.cat([getattr(s, name) for s in self._states]) for name in ("objects", "missed"))
         counts: dict[tuple[int, Cell], tuple[int, int]] = {}
-        rows = zip(torch.cat(objects).tolist(), cells, costs, torch.cat(missed).tolist(), strict=True)
+        rows = zip(objects.tolist(), cells, costs, missed.tolist(), strict=True)
         for index, cell, cost, miss in rows:
             before = counts.get((index, cell), (0, 0))
             counts[index, cell] = (before[0] + cost, before[1] + miss)

@@ -7,8 +7,9 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.methods.base import GRADIENT_PASSES, MAX_RESCORED, Attack, AttackResult, Problem
 from drivesem.attacks.methods.gradient_ascent import APGD, FGSM, SGD, SiFGSM
 from drivesem.attacks.methods.gradient_free import CMAES, FixedTheta, Placebo, Sampling
+from drivesem.attacks.methods.learned import Learn
 from drivesem.attacks.methods.margin_search import (
     FIRST_HELD_OUT_SAMPLE,
     Climb,
@@ -54,6 +56,7 @@ from drivesem.run.labels import RESULT
 from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.run_report import write_run_report
+from drivesem.run.search_memory import SearchMemory
 from drivesem.scenes.sources import NoVehicleError, SceneSource, compile_source_kernels, open_source
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
@@ -315,6 +318,8 @@ class AttackWorker:
     """Grades failures."""
     changes: VehicleChangeSettings | None = None
     """Vehicle changes to propose besides theta."""
+    memory: SearchMemory = field(default_factory=SearchMemory)
+    """What `learn` knows of finished frames."""
 
     @classmethod
     def from_config(cls, config: AttackConfig, detector: Predictor | None = None) -> AttackWorker:
@@ -337,8 +342,12 @@ class AttackWorker:
         """Attack a frame of the source and write its folder; False where it has no vehicle to attack. The result
         stays on disk: a run has thousands of a quarter megabyte each.
         """
+        worker = self
+        if isinstance(self.method, Learn):
+            self.memory.read(out / FRAMES)
+            worker = replace(self, method=replace(self.method, model=self.memory.model()))
         try:
-            attacked = self.attack_scene(identifier, self.source.scene(identifier))
+            attacked = worker.attack_scene(identifier, self.source.scene(identifier))
         except NoVehicleError:
             return False
         write_frame(attacked, out / FRAMES / identifier)
@@ -398,6 +407,7 @@ class AttackWorker:
             grade_notes=notes,
             passes=passes,
             visits=objective.cell_visits(evaluation),
+            margin_rows=objective.search_log.margin_rows() if isinstance(method, Learn) else None,
             seconds=end - start,
             grading_seconds=end - search_end,
         )
@@ -487,6 +497,9 @@ def build_attack(config: AttackConfig) -> Attack:
             return SCW(queries, steps, config.norm, config.rate, early_stop)
         case "climb":
             return Climb(config.passes or Climb().passes)
+        case "learn":
+            _check_learning()
+            return Learn(config.passes or Learn().passes)
         case "corners":
             return Corners(config.passes or Corners().passes)
         case "placebo":
@@ -495,6 +508,12 @@ def build_attack(config: AttackConfig) -> Attack:
             return CMAES(queries, box_steps, early_stop)
         case "random" | "halton":
             return Sampling(queries, box_steps, early_stop, config.method)
+
+
+def _check_learning() -> None:
+    """Raise UsageError where scikit-learn is not installed."""
+    if find_spec("sklearn") is None:
+        raise UsageError("--method", "one without scikit-learn, or pip install 'drivesem[learn]'", "learn")
 
 
 def _steps_for_pass_budget(config: AttackConfig) -> tuple[int, int]:

@@ -226,7 +226,8 @@ def attack(
         combo: Combination of the paper instead of `params`: 1 translate+rotate, 2 translate+rotate+mesh (the
             default), 3 translate+mesh, 4 rotate+mesh.
         budget: Limits of the change: paper, parking, street, or limits such as "translate=0.1".
-        method: si-fgsm, apgd, fgsm, sgd, scw, random, halton, cma-es, corners or climb.
+        method: si-fgsm, apgd, fgsm, sgd, scw, random, halton, cma-es, corners, climb or learn (on one
+            scene the same as climb).
         steps: Gradient steps.
         passes: Detector passes, a gradient counted as 3, instead of `steps` or `queries`.
         queries: Gradients of scw; evaluated renders of gradient-free methods.

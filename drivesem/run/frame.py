@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,6 +44,7 @@ from drivesem.run.results import (
     VehicleCounts,
     dump_frame,
 )
+from drivesem.run.search_memory import MARGINS
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene, to_uint8
@@ -73,6 +75,8 @@ class AttackedScene:
     """Detector passes, a gradient counted as 3."""
     visits: tuple[CellVisit, ...]
     """Where in feature space the objects were evaluated."""
+    margin_rows: np.ndarray | None
+    """(R, F + 1), features and margins for the searches of other frames; None where none reads them."""
     seconds: float
     """Total time."""
     grading_seconds: float
@@ -166,6 +170,8 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
             for c in result.theta
         },
     )
+    if attacked.margin_rows is not None:
+        files.write_npz(part / MARGINS, {"rows": attacked.margin_rows})
     files.write_text(part / RESULT, dump_frame(result))
 
 

@@ -31,6 +31,7 @@ LOADED_WHERE_USED = (
     "torchvision",
     "ultralytics",
     "cma",
+    "sklearn",
     "ray",
     "loky",
     "fsspec",
@@ -81,7 +82,7 @@ _NOT_IN_REPORTS = ("torch", "kornia", "warp", "pyrender", "open3d", "detectors",
 RULES = (
     Rule("scene_ir", (), ("torch", "numpy", "scipy", "kornia", "cv2", "PIL", "trimesh", "warp", "yaml")),
     Rule("detectors", (), ("torch", "numpy", "kornia", "safetensors"), adapters=("detectors.adapters",)),
-    *(Rule(package, (*_LOGIC, *_SEARCH), (*_LOGIC_LIBRARIES, "cma")) for package in _SEARCH),
+    *(Rule(package, (*_LOGIC, *_SEARCH), (*_LOGIC_LIBRARIES, "cma", "sklearn")) for package in _SEARCH),
     # checks, independently, what drivesem.attacks.feasible lets through
     Rule(
         "drivesem.attacks.feasibility_check",

@@ -321,7 +321,7 @@ def _planted_across(config: DetectorBenchConfig, console: Console) -> BenchResul
     pools = [pooling.results[name] for name in names if name in pooling.results]
     kinds = across.KINDS[1::8] if config.quick else across.KINDS
     kinds = [(kind, nth) for nth in range(config.each) for kind in kinds]
-    planted = [across.plant_shared_fault(pools, kind, config.seed, nth) for kind, nth in kinds]
+    planted = [across.plant_shared_fault(pools, kind, config.seed, nth, config.rarity) for kind, nth in kinds]
     faults = [one for one in planted if one is not None]
     console.print(f"{len(faults)} of {len(kinds)} faults could be planted")
     texts = tuple(one.fault.text for one in faults)
@@ -335,10 +335,12 @@ def _planted_across(config: DetectorBenchConfig, console: Console) -> BenchResul
     rows = across_report.rule_rows(faults, pools, judged, tuple(first.workers) if frames else ())
     rule_rows, summed = [row.to_json() for row in rows], across_report.summary_rows(rows)
     summed += across_report.chance_rows(pools, config.seed, across_report.CHANCE_DETECTORS)
+    found = across_report.found_rows(judged, tuple(first.workers), config.seed) if frames else []
     return BenchResult(
         {
             "rows": rule_rows,
             "summary": summed,
+            "found": found,
             "unplanted": ["+".join(kind) for (kind, _), one in zip(kinds, planted, strict=True) if one is None],
             "failed": failed | pooling.failed | searching.failed,
             "method": across_report.METHOD,
@@ -346,6 +348,7 @@ def _planted_across(config: DetectorBenchConfig, console: Console) -> BenchResul
         [
             BenchTable(across_report.TITLE, across_report.COLUMNS, rule_rows),
             BenchTable(across_report.SUMMARY_TITLE, across_report.SUMMARY_COLUMNS, summed),
+            BenchTable(across_report.FOUND_TITLE, across_report.FOUND_COLUMNS, found),
         ],
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
 from drivesem.config.commands import MIN_PASSES, BenchOptions
 from drivesem.config.constraints import NumberRange, OneOf, ParsedBy, at_least, parse_integers
@@ -99,6 +99,8 @@ class DetectorBenchConfig(BenchOptions):
     across: Count | None = None
     """planted: plant one fault per detector for the cars of all frames, and fit rules to all frames. The number of
     Halton states per frame, shared by all faults. --faults: number of faults searched for per frame, in turn."""
+    rarity: Literal["common", "rare"] = "common"
+    """planted with --across: common faults hide 2 to 15 % of the cars in Halton states, rare ones 0.3 to 2 %."""
     each: Count = 1
     """planted with --across: faults of each kind."""
     searched: NotNegative | None = None
@@ -113,6 +115,11 @@ class DetectorBenchConfig(BenchOptions):
         super().check()
         refuse(self.across is not None and self.naming is not None, "--naming", "no --across", self.naming)
         refuse(self.across is None and self.searched is not None, "--searched", "--across", self.searched)
+        learns = "learn" in self.methods.split(",")
+        refuse(learns and self.across is None, "--methods", "--across, for learn", self.methods)
+        refuse(
+            learns and self.workers != 1, "--workers", "1 with learn, which goes from frame to frame", self.workers
+        )
         demo = self.what == "planted" or self.dataset == DEMO
         refuse(not demo, "--dataset", "--dataset demo, but for planted", self.dataset)
 

@@ -109,6 +109,10 @@ class MarginOracle(Protocol):
         """Margins (N,) at theta (D,) in a sample; inf for objects that do not count there. Costs a pass."""
         ...
 
+    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        """Rows (K,) and features (K, F) of the objects that count at theta (D,) in a sample. Costs no pass."""
+        ...
+
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Margins and the gradient of their weighted sum. Costs GRADIENT_PASSES passes.
 

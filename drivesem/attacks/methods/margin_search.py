@@ -154,7 +154,7 @@ class MarginSearchState:
         margins = torch.stack([self.margins(point, self.next_sample()) for point in points])
         values = [self.objective(row) for row in margins]
         order = sorted(range(len(points)), key=values.__getitem__)
-        return [points[order[0]], *(self._combine_objects(points, margins, row) for row in order[:2])]
+        return [points[order[0]], *(self.combine_objects(points, margins, row) for row in order[:2])]
 
     def select_best(self, points: list[Tensor]) -> Tensor:
         """The point with the lowest mean objective in nuisance samples that the search has not used."""
@@ -166,8 +166,9 @@ class MarginSearchState:
             values.append(sum(self.objective(self.oracle.margins(theta, number)) for number in numbers))
         return points[min(range(len(points)), key=values.__getitem__)]
 
-    def _combine_objects(self, points: Tensor, margins: Tensor, scene_row: int) -> Tensor:
-        """The scene coordinates of one point, and each object's own from the point where its margin was lowest.
+    def combine_objects(self, points: Tensor, margins: Tensor, scene_row: int) -> Tensor:
+        """The scene coordinates of one of the points (C, K), and each object's own from the point where its margin
+        (C, N) was lowest.
 
         Where points differ in the scene too, margins are relative to the mean over objects at their point.
         """
@@ -270,19 +271,23 @@ class Climb(MarginSearch):
     """Whether to use gradients where the detector has one."""
 
     def _search(self, search: MarginSearchState) -> Tensor:
-        start = _choose_start(search, max(int(_START_SHARE * self.passes), 1))
+        start = _choose_start(search, self._start_points(search, max(int(_START_SHARE * self.passes), 1)))
         return _Descent(search, self.gradient and search.oracle.differentiable).descend(start)
 
+    def _start_points(self, search: MarginSearchState, count: int) -> Tensor:
+        """Points (count, K) of which the start is made."""
+        return sample_points(search, count)
 
-def _choose_start(search: MarginSearchState, count: int) -> Tensor:
-    """The start u (K,): the best of the candidates that `count` points give."""
-    starts = search.candidates(_sample_points(search, count))
+
+def _choose_start(search: MarginSearchState, points: Tensor) -> Tensor:
+    """The start u (K,): the best of the candidates that the points (C, K) give."""
+    starts = search.candidates(points)
     number = search.next_sample()
     values = [search.objective(search.margins(point, number)) for point in starts]
     return starts[min(range(len(starts)), key=values.__getitem__)]
 
 
-def _sample_points(search: MarginSearchState, count: int) -> Tensor:
+def sample_points(search: MarginSearchState, count: int) -> Tensor:
     """Points (count, K): balanced corners and a scrambled Halton sequence alternately."""
     from scipy.stats import qmc  # imported on use: it takes a third of a second to load
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from detectors.planted import compute_features
-from drivesem.failures.search_log import ObjectPatches, SearchLog
+from drivesem.failures.search_log import OBJECT_FEATURES, ObjectPatches, SearchLog
 
 BOXES = torch.tensor([[10.0, 20, 90, 50], [300, 30, 400, 130]])
 SMALL_LEFT, LARGE_RIGHT = (0, 1, 0, 1), (2, 1, 2, 1)
@@ -54,3 +54,19 @@ def test_visits_count_passes_and_misses_by_object_and_cell() -> None:
     dark = (0, 1, 0, 0)
     assert found == [(0, dark, 1, 1, False), (0, SMALL_LEFT, 1, 0, True), (4, LARGE_RIGHT, 4, 2, False)]
     assert SearchLog().visits([]) == ()
+
+
+def test_rows_of_margins_are_features_of_the_states_that_have_them() -> None:
+    log = SearchLog()
+    both, missed = torch.tensor([0, 4]), torch.tensor([False, True])
+    log.record(picture(), both, BOXES, missed, passes=1)
+    assert log.margin_rows().shape == (0, len(OBJECT_FEATURES) + 1)
+    log.record(picture(), both, BOXES, missed, passes=1, margins=torch.tensor([2.0, -1.0]))
+    rows = dict(zip((*OBJECT_FEATURES, "margin"), log.margin_rows().T.tolist(), strict=True))
+    assert rows["margin"] == [2, -1]
+    assert rows["height_px"] == [30, 100]
+    assert rows["aspect"] == pytest.approx([80 / 30, 1])
+    assert rows["across"] == pytest.approx([50 / 420, 350 / 420])
+    expected = compute_features(picture()[None], BOXES[None], ("lightness",))[0, 0]
+    assert rows["lightness"] == pytest.approx(expected.tolist(), abs=0.05)
+    assert rows["light"] == pytest.approx([0.5, 0.5], abs=0.02)

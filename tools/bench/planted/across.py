@@ -6,7 +6,7 @@ A fault is drawn at random among those of its kind that hide few cars as photogr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +16,14 @@ from detectors.planted import FEATURES, Band, PlantedDetector, PlantedFault
 from detectors.registry import load_detector
 from drivesem.analysis.holes.rules import FeatureSamples
 from drivesem.attacks.budgets import parse_budget
+from drivesem.attacks.methods.learned import Learn
 from drivesem.attacks.objective import Objective
 from drivesem.attacks.space import ParameterSpace, parse_params
 from drivesem.config.errors import UsageError
 from drivesem.config.options import SceneOptions, shared_options
 from drivesem.run.attack import AttackWorker, build_grader
 from drivesem.run.records import dump_record, load_record
+from drivesem.run.search_memory import SearchMemory
 from drivesem.scenes.sources import NoVehicleError, SceneSource
 from scene_ir import files
 from scene_ir.render.compositor import Compositor
@@ -47,10 +49,12 @@ KINDS = tuple(
 """What faults are about, one detector each."""
 AS_PHOTOGRAPHED = 0.1
 """Share of cars found as photographed that a fault may hide there, at most."""
-HIT = (0.02, 0.15)
+HITS = {"common": (0.02, 0.15), "rare": (0.003, 0.02)}
 """Share of cars in Halton's draws, of those that it does not hide as photographed, that a fault hides."""
-CARS, FRAMES = 8, 4
-"""Of so many cars in so many frames at least."""
+CARS = {"common": 8, "rare": 3}
+"""Of so many cars at least."""
+FRAMES = {"common": 4, "rare": 3}
+"""In so many frames at least."""
 BY_ITSELF = 0.6
 """Share of cars in Halton's draws that lie in any one band, at most; the others of a pair halve what it holds."""
 SAMPLES = 16
@@ -113,9 +117,11 @@ class SharedFaultFrame:
 
 
 def plant_shared_fault(
-    pools: Sequence[FramePool], names: Sequence[str], seed: int, nth: int = 0
+    pools: Sequence[FramePool], names: Sequence[str], seed: int, nth: int = 0, rarity: str = "common"
 ) -> SharedFault | None:
-    """The n-th fault of such features; None where none could be drawn. Equal arguments, equal faults."""
+    """The n-th fault of such features, as rare as `HITS` has it; None where none could be drawn. The same for equal
+    arguments.
+    """
     rows = [FEATURES.index(name) for name in names]
     values, still, cars, frames = _reached(pools, rows)
     if not len(values):
@@ -128,15 +134,15 @@ def plant_shared_fault(
         alone = each.mean(0)
         if alone.max() > BY_ITSELF or inside.mean() > (alone.min() if len(rows) == 1 else 0.7 * alone.min()):
             continue
-        if not 0.5 * HIT[0] <= inside.mean() <= 2 * HIT[1]:
+        least, most = HITS[rarity]
+        if not 0.5 * least <= inside.mean() <= 2 * most:
             continue
-        if _inside(still, bands).mean() > 2 * AS_PHOTOGRAPHED or len(np.unique(cars[inside])) < CARS:
+        if _inside(still, bands).mean() > 2 * AS_PHOTOGRAPHED or len(np.unique(cars[inside])) < CARS[rarity]:
             continue
-        if len(np.unique(frames[inside])) < FRAMES:
+        if len(np.unique(frames[inside])) < FRAMES[rarity]:
             continue
-        planted = _measured(
-            pools, PlantedFault(tuple(Band(n, *b) for n, b in zip(names, bands.tolist(), strict=True)))
-        )
+        fault = PlantedFault(tuple(Band(n, *b) for n, b in zip(names, bands.tolist(), strict=True)))
+        planted = _measured(pools, fault, rarity)
         if planted is not None:
             return planted
     return None
@@ -177,7 +183,7 @@ def _inside(values: np.ndarray, bands: np.ndarray) -> np.ndarray:
     return np.all((values >= bands[:, 0]) & (values <= bands[:, 1]), axis=1)
 
 
-def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> SharedFault | None:
+def _measured(pools: Sequence[FramePool], fault: PlantedFault, rarity: str) -> SharedFault | None:
     """The fault and how often it hides what; None where that is too much or too little."""
     pictures = hit = count = lost = found = still = 0
     cars: set[tuple[str, int]] = set()
@@ -195,9 +201,10 @@ def _measured(pools: Sequence[FramePool], fault: PlantedFault) -> SharedFault | 
         cars |= {(pool.frame, car.index) for _, car in lost_here}
         pictures, hit = pictures + len(pool.states), hit + len({number for number, _ in lost_here})
         count, lost = count + len(own), lost + len(lost_here)
-    if not found or not count or still > AS_PHOTOGRAPHED * found or not HIT[0] <= lost / count <= HIT[1]:
+    least, most = HITS[rarity]
+    if not found or not count or still > AS_PHOTOGRAPHED * found or not least <= lost / count <= most:
         return None
-    if len(cars) < CARS or len({frame for frame, _ in cars}) < FRAMES:
+    if len(cars) < CARS[rarity] or len({frame for frame, _ in cars}) < FRAMES[rarity]:
         return None
     return SharedFault(fault, hit / pictures, lost / count, still / found, sharpness(pools, fault))
 
@@ -213,6 +220,8 @@ class SharedFaultBench:
     """Folder of what is done."""
     faults: tuple[str, ...] = ()
     """In words."""
+    memories: dict[str, SearchMemory] = field(default_factory=dict[str, SearchMemory])
+    """By fault, what `learn` knows of earlier frames."""
 
     @classmethod
     def of(cls, config: DetectorBenchConfig, faults: tuple[str, ...] = ()) -> SharedFaultBench:
@@ -267,7 +276,7 @@ class SharedFaultBench:
         chosen = self.turn(number)
         settings = self._format_settings(("params", "budget", "detector", "methods", "passes")) + repr(chosen)
         path = None if self.folder is None else self.folder / "frames" / f"{name}.json"
-        if path is not None and self.config.resume and path.is_file():
+        if path is not None and self.config.resume and "learn" not in self.workers and path.is_file():
             known = load_record(path, SharedFaultFrame, SCHEMA)
             if known.settings == settings:
                 return known
@@ -291,11 +300,15 @@ class SharedFaultBench:
     def _attempt(
         self, name: str, scene: SceneIR, fault: str, method: str, inner: CachingDetector
     ) -> SharedFaultSearch:
-        worker = self.workers[method]
+        worker, memory = self.workers[method], self.memories.setdefault(fault, SearchMemory())
+        if isinstance(worker.method, Learn):
+            worker = replace(worker, method=replace(worker.method, model=memory.model()))
         detector = PlantedDetector(inner, PlantedFault.parse(fault)).requires_grad_(False) if fault else inner
         attacked = replace(worker, detector=detector, grader=build_grader(worker.config, detector)).attack_scene(
             name, scene
         )
+        if attacked.margin_rows is not None:
+            memory.add(name, attacked.margin_rows)
         certain = certain_losses(attacked)
         seen = detected_without_fault(self.detector, attacked) if certain else ()
         neighbourhoods = tuple(

@@ -10,9 +10,9 @@ import numpy as np
 
 from detectors.planted import PlantedFault
 from drivesem.bench.session import Columns
-from drivesem.evaluation.resampling import wilson
+from drivesem.evaluation.resampling import DRAWS, wilson
 from drivesem.failures.rules import Flags, Floats, Intervals, fit_rule_list, format_rule
-from tools.bench.planted.across import SharedFault, SharedFaultFrame
+from tools.bench.planted.across import SharedFault, SharedFaultFrame, SharedFaultSearch
 from tools.bench.planted.pool import FramePool, bands_by_label, hidden
 from tools.bench.planted.yardstick import rule_names_fault
 
@@ -63,6 +63,22 @@ SUMMARY_COLUMNS: Columns = {
     "with_rule": ("with a rule", "rule"),
     "further": ("further rules", "further"),
     "passes": ("passes a detector", "passes"),
+}
+
+
+FOUND_TITLE = "cars lost by a fault"
+FOUND_COLUMNS: Columns = {
+    "method": ("method", "method"),
+    "faults": ("faults searched for", "searched"),
+    "faults_found": ("found", "found"),
+    "certain": ("cars lost for certain", "certain"),
+    "found": ("by a fault", "by fault"),
+    "per_1000": ("for 1,000 passes", "/1,000 passes"),
+    "low": ("from", "from"),
+    "high": ("to", "to"),
+    "difference": ("less the first method", "less first"),
+    "difference_low": ("from", "from"),
+    "difference_high": ("to", "to"),
 }
 
 
@@ -220,6 +236,45 @@ def summary_rows(rows: Sequence[FaultRuleRow]) -> list[dict[str, Any]]:
                 }
             )
     return found
+
+
+def found_rows(judged: Sequence[SharedFaultFrame], methods: Sequence[str], seed: int) -> list[dict[str, Any]]:
+    """Cars that each method loses by a fault, for 1,000 passes, and how many more than the first method; intervals
+    by bootstrap over frames.
+    """
+
+    def attempts(method: str) -> list[list[SharedFaultSearch]]:
+        return [[a for a in frame.attempts if a.fault and a.method == method] for frame in judged]
+
+    def sums(method: str, name: str) -> np.ndarray:
+        return np.array([sum(getattr(a, name) for a in own) for own in attempts(method)], np.float64)
+
+    rows = []
+    for method in methods:
+        own = [attempt for frame in attempts(method) for attempt in frame]
+        found, passes = sums(method, "found"), sums(method, "passes") / 1000
+        first_found, first_passes = sums(methods[0], "found"), sums(methods[0], "passes") / 1000
+        drawn = np.random.default_rng(seed).integers(len(judged), size=(DRAWS, len(judged)))
+        rates = found[drawn].sum(1) / passes[drawn].sum(1)
+        more = rates - first_found[drawn].sum(1) / first_passes[drawn].sum(1)
+        low, high = np.quantile(rates, (0.025, 0.975)).tolist()
+        more_low, more_high = np.quantile(more, (0.025, 0.975)).tolist()
+        rows.append(
+            {
+                "method": method,
+                "faults": len({a.fault for a in own}),
+                "faults_found": len({a.fault for a in own if a.found}),
+                "certain": sum(a.certain for a in own),
+                "found": int(found.sum()),
+                "per_1000": float(found.sum() / passes.sum()),
+                "low": low,
+                "high": high,
+                "difference": float(found.sum() / passes.sum() - first_found.sum() / first_passes.sum()),
+                "difference_low": more_low,
+                "difference_high": more_high,
+            }
+        )
+    return rows
 
 
 def _row(one: SharedFault | None, by: str, evidence: PooledSamples, pools: Sequence[FramePool]) -> FaultRuleRow:

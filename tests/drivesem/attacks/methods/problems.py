@@ -176,6 +176,10 @@ class Street:
         self.thetas.append(theta)
         return self.known_margins(theta, number)
 
+    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        rows = self.counted_objects.nonzero()[:, 0]
+        return rows, torch.cat([theta[POSITION].reshape(CARS, 2) - LOST_AT, theta[PAINT][:, None]], 1)[rows]
+
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
         self.passes += 3
         self.thetas.append(theta)

@@ -10,14 +10,17 @@ from tools.bench.planted.across import (
     AS_PHOTOGRAPHED,
     CARS,
     FRAMES,
-    HIT,
+    HITS,
     KINDS,
+    SharedFaultFrame,
+    SharedFaultSearch,
     plant_shared_fault,
 )
 from tools.bench.planted.across_report import (
     ALL,
     FaultRuleRow,
     chance_rows,
+    found_rows,
     rule_rows,
     summary_rows,
 )
@@ -56,17 +59,19 @@ def pools() -> list[FramePool]:
     return world(20, 12)
 
 
-@pytest.mark.parametrize("kind", [KINDS[0], KINDS[3], KINDS[8]])
+@pytest.mark.parametrize(
+    ("kind", "rarity"), [(KINDS[0], "common"), (KINDS[3], "common"), (KINDS[8], "common"), (KINDS[8], "rare")]
+)
 def test_faults_hide_few_cars_as_photographed_and_some_others(
-    pools: list[FramePool], kind: tuple[str, ...]
+    pools: list[FramePool], kind: tuple[str, ...], rarity: str
 ) -> None:
-    one = plant_shared_fault(pools, kind, 0)
+    one = plant_shared_fault(pools, kind, 0, 0, rarity)
     assert one is not None
     assert one.fault.feature_names == kind
-    assert one == plant_shared_fault(pools, kind, 0)
-    assert one != plant_shared_fault(pools, kind, 1)
+    assert one == plant_shared_fault(pools, kind, 0, 0, rarity)
+    assert one != plant_shared_fault(pools, kind, 1, 0, rarity)
     assert one.still <= AS_PHOTOGRAPHED
-    assert HIT[0] <= one.cars <= HIT[1]
+    assert HITS[rarity][0] <= one.cars <= HITS[rarity][1]
     assert one.hit >= one.cars
     assert 0.4 < one.sharp < 1
     hidden = {
@@ -76,8 +81,8 @@ def test_faults_hide_few_cars_as_photographed_and_some_others(
         for car in state
         if car.hidden(one.fault, T_STAR) and car.index not in pool.hidden_as_photographed(one.fault)
     }
-    assert len(hidden) >= CARS
-    assert len({frame for frame, _ in hidden}) >= FRAMES
+    assert len(hidden) >= CARS[rarity]
+    assert len({frame for frame, _ in hidden}) >= FRAMES[rarity]
 
 
 def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
@@ -111,3 +116,25 @@ def test_rows_are_summed_by_what_named_them() -> None:
     assert (planted["further"], planted["passes"]) == (1, 200)
     assert (none["by"], none["named"], none["with_rule"], none["further"]) == ("climb, no fault", None, 1, 2)
     assert one.to_json()["rule"] == "a"
+
+
+def search_of(fault: str, method: str, found: int) -> SharedFaultSearch:
+    return SharedFaultSearch("", fault, method, found + 1, found, 50, ())
+
+
+def test_cars_lost_by_faults_are_counted_by_method_with_paired_differences() -> None:
+    frames = [
+        SharedFaultFrame(
+            str(number),
+            "",
+            tuple(
+                search_of(fault, m, found) for fault in ("a", "b", "") for m, found in (("climb", 1), ("learn", 3))
+            ),
+        )
+        for number in range(4)
+    ]
+    climb, learn = found_rows(frames, ("climb", "learn"), 0)
+    assert (climb["found"], learn["found"], climb["certain"]) == (8, 24, 16)
+    assert (climb["faults"], climb["faults_found"]) == (2, 2)
+    assert (climb["per_1000"], learn["per_1000"]) == (20, 60)
+    assert [learn[name] for name in ("difference", "difference_low", "difference_high")] == [40, 40, 40]
