@@ -166,7 +166,9 @@ def relocate_person(scene: SceneIR, row: int, place: Tensor, vehicle: int) -> Sc
     drawn = torch.cat([layers.colour[packed, :3], layers.opacity[packed, None]], dim=1).T.reshape(4, *size)
     foreground = Crop(drawn.to(scene.background).clamp(0.0, 1.0).contiguous(), x0, y0)
     alone = replace(moved.objects, source=(), **{n: getattr(moved.objects, n)[row : row + 1] for n in _TENSORS})
-    shadow = _cast_shadow(scene, alone, [old, *objects.source])
+    alone = replace(alone, mesh_index=torch.zeros_like(alone.mesh_index))
+    mesh = scene.meshes[int(objects.mesh_index[row])]
+    shadow = _cast_shadow(scene, mesh, alone, [old, *objects.source])
     source = replace(old, translation=place, yaw=yaw[row], foreground=foreground, shadow=shadow, region=None)
     sources = list(complete_uncovered_sources(scene, {row}))
     sources[row] = source
@@ -271,13 +273,13 @@ def _render_vehicle(scene: SceneIR, vehicle: Vehicle) -> _RenderedVehicle:
     row = replace(_object_row(vehicle_render, 0, scene), source=())
     alone = _render_object(scene, row, mesh)
     nearest = (scene.objects.translation - vehicle.translation).norm(dim=1).argsort().tolist()
-    shadow = _cast_shadow(replace(scene, meshes=(mesh,)), row, [sources[i] for i in nearest])
+    shadow = _cast_shadow(scene, mesh, row, [sources[i] for i in nearest])
     return replace(vehicle_render, source=replace(vehicle_render.source, foreground=alone.rgba, shadow=shadow))
 
 
-def _cast_shadow(scene: SceneIR, row: Objects, like: Sequence[Source]) -> Crop:
-    """Shadow of `row`, one object, in a scene's sun, as dark as the first shadow of `like`."""
-    shadow = analytic_shadows(replace(scene, objects=row, occluders=(), before=None))[0]
+def _cast_shadow(scene: SceneIR, mesh: Mesh, row: Objects, like: Sequence[Source]) -> Crop:
+    """Shadow of `row`, one object of `mesh`, in a scene's sun, as dark as the first shadow of `like`."""
+    shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))[0]
     dark = 1.0 - shadow.values
     if dark.numel():
         dark = dark * (_shadow_darkness(like) / dark.max().clamp(min=_MIN_BOX_DARKNESS))
