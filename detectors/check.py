@@ -125,12 +125,12 @@ _SAME_PLACE_PX = 1.0
 
 @dataclass(frozen=True, slots=True)
 class StreetDetections:
-    """Cars that a detector finds in pictures of streets with cars."""
+    """Cars, or objects of other classes, that a detector finds in pictures of streets with some."""
 
     pictures: int
     """Number of pictures."""
     boxes: int
-    """Cars with a score of at least t*."""
+    """Objects of the classes with a score of at least t*."""
     score_low: float | None
     """Lowest score of all detections, of any class; None if there is none."""
     score_high: float | None
@@ -140,7 +140,7 @@ class StreetDetections:
     height_high_px: float | None
     """Height of the highest, px."""
     problem: str | None
-    """Why this is no detector of cars, as far as the pictures show; None if nothing is wrong."""
+    """Why this is no detector of the classes, as far as the pictures show; None if nothing is wrong."""
 
     @property
     def as_check(self) -> ContractCheck:
@@ -159,29 +159,35 @@ STREET_CHECK = "cars on streets"
 
 
 def survey_streets(
-    detector: Predictor, pictures: Iterable[Tensor], t_star: float, until_found: bool = False
+    detector: Predictor,
+    pictures: Iterable[Tensor],
+    t_star: float,
+    until_found: bool = False,
+    classes: Sequence[str] = (CAR,),
 ) -> tuple[StreetDetections, list[Detections]]:
-    """Detect cars in pictures of streets with cars.
+    """Detect cars, or objects of other classes, in pictures of streets with some.
 
     Args:
         detector: The detector under test.
         pictures: Each (3, H, W) in [0, 1], on the detector's device.
         t_star: Lowest score of a detection that counts.
-        until_found: End with the first picture in which cars are found.
+        until_found: End with the first picture in which one is found.
+        classes: Classes to detect.
 
     Returns:
         What was found in them, and the detections in each.
     """
     found: list[Detections] = []
-    label = detector.classes.index(CAR) if CAR in detector.classes else -1
+    labels = torch.tensor([i for i, name in enumerate(detector.classes) if name in classes])
+    noun = " or ".join(classes)
     for picture in pictures:
         found.extend(predict(detector, picture[None]))
-        survey = _summarise_streets(found, label, t_star)
+        survey = _summarise_streets(found, labels, t_star, noun)
         if until_found and survey.boxes and survey.problem is None:
             break
-    survey = _summarise_streets(found, label, t_star)
-    if label < 0:
-        survey = replace(survey, problem=f"no class {CAR} among {', '.join(detector.classes[:6])}")
+    survey = _summarise_streets(found, labels, t_star, noun)
+    if not len(labels):
+        survey = replace(survey, problem=f"no class {noun} among {', '.join(detector.classes[:6])}")
     reading = describe_reading(detector)
     if survey.problem is not None and reading:
         survey = replace(survey, problem=f"{survey.problem}; {reading}")
@@ -194,9 +200,10 @@ def describe_reading(detector: Predictor) -> str:
     return decoder.describe() if isinstance(decoder, OutputDecoder) else getattr(detector, "reading", "")
 
 
-def _summarise_streets(found: Sequence[Detections], label: int, t_star: float) -> StreetDetections:
-    cars = [one.boxes_xyxy[(one.labels == label) & (one.scores >= t_star)] for one in found]
-    boxes_xyxy = torch.cat(cars) if cars else torch.zeros(0, 4)
+def _summarise_streets(found: Sequence[Detections], labels: Tensor, t_star: float, noun: str) -> StreetDetections:
+    rows = [torch.isin(one.labels, labels.to(one.labels)) for one in found]
+    boxes = [one.boxes_xyxy[mine & (one.scores >= t_star)] for one, mine in zip(found, rows, strict=True)]
+    boxes_xyxy = torch.cat(boxes) if boxes else torch.zeros(0, 4)
     scores = torch.cat([one.scores for one in found]) if found else torch.zeros(0)
     sides = boxes_xyxy[:, 2:] - boxes_xyxy[:, :2]
     low, high = (float(scores.min()), float(scores.max())) if len(scores) else (None, None)
@@ -205,10 +212,10 @@ def _summarise_streets(found: Sequence[Detections], label: int, t_star: float) -
         problem = f"scores outside [0, 1], from {low:.3g} to {high:.3g}"
     elif not len(boxes_xyxy):
         best = f"the best score is {high:.3g}" if high is not None else "no detection at all"
-        of_cars = [float(one.scores[one.labels == label].max()) for one in found if (one.labels == label).any()]
-        if of_cars:
-            best = f"the best score of one is {max(of_cars):.3g}"
-        problem = f"no car with a score of {t_star:.3g} or more in {len(found)} pictures ({best})"
+        of_them = [float(one.scores[mine].max()) for one, mine in zip(found, rows, strict=True) if mine.any()]
+        if of_them:
+            best = f"the best score of one is {max(of_them):.3g}"
+        problem = f"no {noun.lower()} with a score of {t_star:.3g} or more in {len(found)} pictures ({best})"
     elif float(sides.amax(1).max()) < TINY_PX:
         problem = f"only boxes with sides below {TINY_PX:g} px"
     elif len(boxes_xyxy) > 1 and float((boxes_xyxy - boxes_xyxy[0]).abs().max()) < _SAME_PLACE_PX:

@@ -1,4 +1,4 @@
-"""Exchange, add and remove vehicles in a scene, as streets change from one day to the next.
+"""Exchange, add, move and remove objects of a scene, as streets change from one day to the next.
 
 The previous scene stays available as `SceneIR.before` with the same objects, row by row. A vehicle that is in only
 one of the two stands behind the camera in the other, out of reach of pictures, labels and constraints.
@@ -17,7 +17,7 @@ from torch import Tensor
 from scene_ir.errors import RangeError
 from scene_ir.geometry import to_clip
 from scene_ir.removal import complete_uncovered_sources
-from scene_ir.render import finish, model, texture
+from scene_ir.render import finish, model, surfaces, texture
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import analytic_shadows
 from scene_ir.types import (
@@ -133,6 +133,51 @@ def replace_vehicle(scene: SceneIR, row: int, vehicle: Vehicle) -> SceneIR:
 
 
 @torch.no_grad()
+def relocate_person(scene: SceneIR, row: int, place: Tensor, vehicle: int) -> SceneIR:
+    """The scene with a person or cyclist behind a vehicle, drawn and lit as if photographed there.
+
+    The surface keeps facing the camera, so the label turns with the direction in which the camera sees it.
+
+    Args:
+        scene: A scene in which nothing was exchanged yet.
+        row: The person.
+        place: (3,) m, where the feet stand.
+        vehicle: Row of the vehicle, for the description of the change.
+
+    Returns:
+        The changed scene.
+
+    Raises:
+        RangeError: An unknown row, a vehicle's row, or missing sources.
+    """
+    _check_exchangeable(scene, row)
+    objects, old = scene.objects, scene.objects.source[row]
+    if not bool(objects.upright[row]):
+        raise RangeError("objects", "a row of a person or cyclist", row)
+    centre = surfaces.camera_centre(scene.camera.matrix).to(place)
+    bearings = [torch.atan2(centre[2] - at[2], at[0] - centre[0]) for at in (old.translation, place)]
+    translation, yaw = objects.translation.clone(), objects.yaw.clone()
+    translation[row], yaw[row] = place, old.yaw + bearings[1] - bearings[0]
+    compositor = Compositor(scene.unperturbed())
+    moved = compositor.scene.with_objects(translation=translation, yaw=yaw)
+    layers = compositor.draw_layers(compositor.perturbed_objects(moved))
+    packed, size = layers.layout.spans()[row]
+    x0, y0 = layers.layout.rects[row, :2].tolist()
+    drawn = torch.cat([layers.colour[packed, :3], layers.opacity[packed, None]], dim=1).T.reshape(4, *size)
+    foreground = Crop(drawn.to(scene.background).clamp(0.0, 1.0).contiguous(), x0, y0)
+    alone = replace(moved.objects, source=(), **{n: getattr(moved.objects, n)[row : row + 1] for n in _TENSORS})
+    alone = replace(alone, mesh_index=torch.zeros_like(alone.mesh_index))
+    mesh = scene.meshes[int(objects.mesh_index[row])]
+    shadow = _cast_shadow(scene, mesh, alone, [old, *objects.source])
+    source = replace(old, translation=place, yaw=yaw[row], foreground=foreground, shadow=shadow, region=None)
+    sources = list(complete_uncovered_sources(scene, {row}))
+    sources[row] = source
+    index = objects.mesh_index.clone()
+    changed = replace(objects, mesh_index=index, translation=translation, yaw=yaw, source=tuple(sources))
+    return record_exchange(scene, scene, changed, f"objects[{row}] stands behind objects[{vehicle}]")
+
+
+@torch.no_grad()
 def add_roof_load(scene: SceneIR, row: int, load: Mesh) -> SceneIR:
     """The scene with a load on the roof of a photographed vehicle.
 
@@ -227,15 +272,18 @@ def _render_vehicle(scene: SceneIR, vehicle: Vehicle) -> _RenderedVehicle:
     vehicle_render = _RenderedVehicle(vehicle, mesh, _blank_source(vehicle, mesh, _sunlight(scene)))
     row = replace(_object_row(vehicle_render, 0, scene), source=())
     alone = _render_object(scene, row, mesh)
-    shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))[0]
     nearest = (scene.objects.translation - vehicle.translation).norm(dim=1).argsort().tolist()
+    shadow = _cast_shadow(scene, mesh, row, [sources[i] for i in nearest])
+    return replace(vehicle_render, source=replace(vehicle_render.source, foreground=alone.rgba, shadow=shadow))
+
+
+def _cast_shadow(scene: SceneIR, mesh: Mesh, row: Objects, like: Sequence[Source]) -> Crop:
+    """Shadow of `row`, one object of `mesh`, in a scene's sun, as dark as the first shadow of `like`."""
+    shadow = analytic_shadows(replace(scene, meshes=(mesh,), objects=row, occluders=(), before=None))[0]
     dark = 1.0 - shadow.values
     if dark.numel():
-        dark = dark * (_shadow_darkness([sources[i] for i in nearest]) / dark.max().clamp(min=_MIN_BOX_DARKNESS))
-    source = replace(
-        vehicle_render.source, foreground=alone.rgba, shadow=replace(shadow, values=1.0 - dark.clamp(0.0, 1.0))
-    )
-    return replace(vehicle_render, source=source)
+        dark = dark * (_shadow_darkness(like) / dark.max().clamp(min=_MIN_BOX_DARKNESS))
+    return replace(shadow, values=1.0 - dark.clamp(0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)

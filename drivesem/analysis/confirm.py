@@ -525,7 +525,7 @@ def build_confirm_notes(report: Confirmation) -> list[str]:
             notes.append(f"Frame {frame}, {name_failure(one.failure)}: the run counted otherwise: {before}.")
     if report.overlap is not None:
         mean, least, count = report.overlap
-        notes.append(f"IoU of the boxes of {count} vehicles in both pictures: mean {mean:.3f}, least {least:.3f}.")
+        notes.append(f"IoU of the boxes of {count} objects in both pictures: mean {mean:.3f}, least {least:.3f}.")
     notes += [f"Frame {name} is not counted: {'; '.join(why)}." for name, why in report.not_carried.items()]
     return notes
 

@@ -159,7 +159,7 @@ def _check_totals(run: AttackRun, verifier: FrameVerifier) -> CheckLog:
     results = [frame.result for frame in run.frames]
     params, detector = verifier.settings.params, verifier.settings.detector
     computed = summarise_run(verifier.attack, params, detector, results).to_json()
-    for name in (*_NOT_COMPUTED, *({"map", "rate"} - metrics.keys())):  # runs of earlier versions lack them
+    for name in (*_NOT_COMPUTED, *({"map", "rate", "by_class"} - metrics.keys())):  # earlier versions lack them
         del computed[name]
     recorded = dict(_flatten("", metrics))
     for name, value in _flatten("", computed):

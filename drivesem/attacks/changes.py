@@ -1,5 +1,5 @@
-"""Proposals of vehicle changes: another vehicle in a car's place, one more or one fewer parked car, a load on a
-roof.
+"""Proposals of changes: another vehicle in a car's place, one more or one fewer car, a load on a roof, a person who
+stands half hidden behind a vehicle.
 
 Each proposal is a scene that theta changes like the first one (`scene_ir.exchange`). A few are evaluated under
 nuisances at the theta that a search found, and the one with the lowest margins is taken, or the unchanged scene.
@@ -22,10 +22,12 @@ from drivesem.attacks.space import ground_axes
 from scene_ir import exchange
 from scene_ir.errors import FormatError
 from scene_ir.exchange import Vehicle
+from scene_ir.geometry import ground_footprint
 from scene_ir.meshes.load import ImportedMesh
 from scene_ir.meshes.templates import ROOF_LOADS, make_roof_load, template, typical_size_lhw
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
+from scene_ir.render.surfaces import camera_centre
 from scene_ir.types import Category, Mesh, SceneIR
 
 SAMPLES = 2
@@ -54,6 +56,12 @@ _OCCLUDER_DISTANCE = (0.55, 0.85)
 """Distance of a vehicle that hides a part of a car, as a share of the car's distance."""
 _OCCLUDER_OFFSET = (0.4, 1.2)
 """Its lateral offset, in own widths."""
+_BEHIND_M = (0.4, 1.5)
+"""Distance of a person behind the end of the vehicle that hides a part of it."""
+_COVERED = (0.3, 0.7)
+"""Share of the person's width behind the vehicle's outline; more shows above a low vehicle."""
+_MAX_ENLARGEMENT = 1.3
+"""Maximum magnification of a person's photograph."""
 
 
 class VehicleChange(StrEnum):
@@ -67,11 +75,13 @@ class VehicleChange(StrEnum):
     """Another vehicle stands in a car's place."""
     LOAD = "load"
     """A box, cases or a crate lie on a car's roof."""
+    EMERGE = "emerge"
+    """A person of the frame stands half hidden behind an end of a vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleChangeSettings:
-    """Which vehicle changes are proposed."""
+    """Which changes are proposed."""
 
     kinds: tuple[VehicleChange, ...]
     """Kinds of changes."""
@@ -80,7 +90,7 @@ class VehicleChangeSettings:
 
 
 def parse_vehicle_changes(text: str) -> tuple[VehicleChange, ...]:
-    """Kinds from "leave,park,swap,load". Raises FormatError naming the unknown one and the known ones."""
+    """Kinds from "leave,park,swap,load,emerge". Raises FormatError naming the unknown one and the known ones."""
     names = [part.strip() for part in text.split(",")]
     for name in names:
         if name not in list(VehicleChange) or names.count(name) > 1:
@@ -135,8 +145,11 @@ def propose_scenes(
     for turn in range(count):
         kind = changes.kinds[turn % len(changes.kinds)]
         for attempt in _generate_attempts(scene, kind, changes.mesh, rows, rng):
-            if not check_exchange(attempt):
-                proposals.append(_with_moved_labels(attempt, settings))
+            if check_exchange(attempt):
+                continue
+            labelled = _with_moved_labels(attempt, settings)
+            if kind is not VehicleChange.EMERGE or _is_half_hidden(scene, labelled):
+                proposals.append(labelled)
                 break
     return proposals
 
@@ -149,8 +162,20 @@ def _generate_attempts(
     rng: np.random.Generator,
 ) -> Iterator[SceneIR]:
     """Scenes with a change of one kind, feasible or not, without moved labels."""
-    for _ in range(_ATTEMPTS):
+    upright = scene.objects.upright.tolist()
+    if change is not VehicleChange.LEAVE:
+        rows = [row for row in rows if upright[row] == (change is VehicleChange.EMERGE)]
+    for _ in range(_ATTEMPTS if rows else 0):
         row = int(rng.choice(rows))
+        if change is VehicleChange.EMERGE:
+            vehicles = [i for i, person in enumerate(upright) if not person]
+            if not vehicles:
+                return
+            vehicle = int(rng.choice(vehicles))
+            place = _choose_place_behind(scene, row, vehicle, rng)
+            if place is not None:
+                yield exchange.relocate_person(scene, row, place, vehicle)
+            continue
         if change is VehicleChange.LEAVE:
             yield exchange.remove_vehicle(scene, row)
             continue
@@ -203,6 +228,36 @@ def _choose_parking_place(
     nearer = torch.stack([share * place[0], place.new_zeros(()), share * place[2]])
     nearer[1] = -(ground[0] * nearer[0] + ground[2] * nearer[2]) / ground[1]
     return place + nearer + side * rng.uniform(*_OCCLUDER_OFFSET) * size_lhw[2] * across
+
+
+def _choose_place_behind(scene: SceneIR, row: int, vehicle: int, rng: np.random.Generator) -> Tensor | None:
+    """Position (3,) m of a person behind the left or right end of a vehicle, as the camera sees it, where a part of
+    the person's width shows; None where the photograph would be enlarged too much.
+    """
+    objects, ground = scene.objects, scene.environment.ground.double()
+    here = objects.translation[row].double()
+    centre = camera_centre(scene.camera.matrix.double())
+    corners = ground_footprint(
+        *(part[vehicle : vehicle + 1].double() for part in (objects.size_lhw, objects.yaw, objects.translation))
+    )[0]
+    across, ahead = (corners - centre[[0, 2]]).unbind(1)
+    bearing = torch.atan2(across, ahead)
+    side = float(rng.choice((-1.0, 1.0)))
+    end = int((side * bearing).argmax())
+    distance = float(torch.hypot(across[end], ahead[end])) + rng.uniform(*_BEHIND_M)
+    if float((here - centre)[[0, 2]].norm()) > _MAX_ENLARGEMENT * distance or float(ahead.min()) < 1.0:
+        return None
+    shift = side * (0.5 - rng.uniform(*_COVERED)) * float(objects.size_lhw[row, 2]) / distance
+    angle = bearing[end] + shift
+    place = torch.stack([centre[0] + distance * angle.sin(), here[1], centre[2] + distance * angle.cos()])
+    place[1] += -(ground[:3] @ (place - here)) / ground[1]
+    return place.to(objects.translation)
+
+
+def _is_half_hidden(scene: SceneIR, changed: SceneIR) -> bool:
+    """Whether the person that `changed` moved is partly hidden there, and wholly inside of the picture."""
+    (row,) = (changed.objects.translation != scene.objects.translation).any(dim=1).nonzero()[:, 0].tolist()
+    return int(changed.objects.occlusion[row]) == 1 and float(changed.objects.truncation[row]) == 0
 
 
 def _with_moved_labels(changed: SceneIR, settings: RenderSettings | None) -> SceneIR:

@@ -210,7 +210,7 @@ def check_exchange(scene: SceneIR, method: CheckMethod | None = None) -> list[st
     present = [i for i in rows if after[i].near > 0]
     violations = []
     for i in present:
-        lines = _road_violations(base, road, before[i], after[i])
+        lines = _road_violations(base, road, before[i], after[i], steps_onto_road=True)
         if before[i].near < 0:
             share = _road_share(base, road, after[i]) or 0.0
             lines = [] if share >= PARKED_ON_ROAD else [f"off the road, {share:.2f} of its footprint on it"]
@@ -559,12 +559,16 @@ def _mesh_violations(old: _MeasuredCar, new: _MeasuredCar) -> list[str]:
     return violations
 
 
-def _road_violations(base: SceneIR, road: Array, old: _MeasuredCar, new: _MeasuredCar) -> list[str]:
+def _road_violations(
+    base: SceneIR, road: Array, old: _MeasuredCar, new: _MeasuredCar, steps_onto_road: bool = False
+) -> list[str]:
+    """Whether an object leaves the road, or a person the level ground off it; `steps_onto_road`: or either."""
     if old.person and (_road_share(base, road, old, at_feet=True) or 0.0) < 0.5:
         green = base.environment.foliage_map.numpy().astype(np.float64)
         on_grass = (_road_share(base, green, old, at_feet=True) or 0.0) >= 0.5
         sure = ((road - 0.5) / 0.3).clip(0, 1)
-        road = _level_ground(base) * (1 - sure) * (1.0 if on_grass else 1 - green)
+        level = _level_ground(base) * (1.0 if on_grass else 1 - green)
+        road = np.maximum(level, road) if steps_onto_road else level * (1 - sure)
     before, after = (_road_share(base, road, car) for car in (old, new))
     if before is None or after is None or after >= before - ROAD_LOSS - ROAD_TOLERANCE:
         return []

@@ -55,6 +55,7 @@ def _print(summary: RunSummary, console: Console) -> None:
         f"frames broken by threshold: {summary.broken.format('attacked frames')}; feasible {feasible}; "
         f"{format_count(summary.queries, 'query', 'queries')} in {summary.seconds:.0f} s",
         summarise_grades(summary),
+        *filter(None, [summarise_classes(summary)]),
         summary.map.describe(),
         summary.describe_rate(),
     )
@@ -90,6 +91,16 @@ def summarise_grades(summary: RunSummary) -> str:
         return f"no certain failure: {failures} by threshold, which chance may explain{by_kind}{unknown}"
     by_grade = f"{certain} certain, {grades[Grade.CONFIRMED]} confirmed, {grades[Grade.SHARED]} shared"
     return f"failures: {by_grade}, of {failures} by threshold{by_kind}{unknown}"
+
+
+def summarise_classes(summary: RunSummary) -> str:
+    """Numbers of failures by class, in one line; "" unless people and vehicles are both attacked."""
+    counts = ((name, summary.by_class[name]) for name in summary.attacked_classes)
+    parts = [
+        f"{name} {one.grades[Grade.CERTAIN]} certain of {one.grades[Grade.THRESHOLD]} ({one.found_before} found before)"
+        for name, one in counts
+    ]
+    return f"failures by class: {'; '.join(parts)}" if parts else ""
 
 
 def report_command(config: ReportConfig) -> int:

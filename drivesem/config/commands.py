@@ -135,7 +135,7 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     grade: bool = True
     """Compute certificates; without them every failure has the grade threshold."""
     changes: Annotated[str, OnlyWith("method", ("climb", "corners", "learn"))] | None = None
-    """Changes of vehicles with --budget street: leave, park, swap, load, with commas (climb, corners, learn)."""
+    """Changes of objects with --budget street: leave, park, swap, load, emerge (people), with commas."""
     mesh: str | None = None
     """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY in metres (default: the templates)."""
     target_objects: str | None = None
@@ -173,6 +173,8 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
         refuse(None not in (self.passes, self.queries), "--queries", "no --passes", f"--passes {self.passes}")
         street = self.budget.split(",")[0] == "street"
         refuse(self.changes is not None and not street, "--changes", "--budget street", f"--budget {self.budget}")
+        emerge = "emerge" in [part.strip() for part in (self.changes or "").split(",")]
+        refuse(emerge and not self.moves_people, "--changes", "no emerge without --people", self.changes)
         refuse(self.mesh is not None and self.changes is None, "--mesh", "--changes", "none")
         unlike = method == "placebo" and self.like is None
         refuse(unlike, "--like", "a run of drivesem attack, for --method placebo", "nothing")

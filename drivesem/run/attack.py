@@ -35,7 +35,7 @@ from drivesem.attacks.methods.margin_search import (
 from drivesem.attacks.methods.scw import SCW
 from drivesem.attacks.objective import GRADIENT_FREE_TERMS, Objective
 from drivesem.attacks.space import Parameter, parse_params
-from drivesem.attacks.targets import EvaluatedClasses, TargetSelection, resolve_t_star
+from drivesem.attacks.targets import HEADLINE, EvaluatedClasses, TargetSelection, resolve_t_star
 from drivesem.config.commands import DEFAULT_QUERIES, GRADIENT_FREE_METHODS, AttackConfig
 from drivesem.config.constraints import parse_part
 from drivesem.config.devices import check_device
@@ -228,8 +228,10 @@ def write_run_summary(
 
 
 def _check_detections(worker: AttackWorker, names: Sequence[str]) -> None:
-    """Raise UsageError for a detector that finds no car in the first photographs: it has nothing to lose."""
+    """Raise UsageError for a detector that finds no object in the first photographs: it has nothing to lose."""
     config = worker.config
+    known = EvaluatedClasses.from_detector(worker.detector).names
+    classes = known if config.moves_people else (HEADLINE,)
     t_star = resolve_t_star(worker.detector, config.t_star)
     if len(names) < 2:
         return
@@ -241,10 +243,12 @@ def _check_detections(worker: AttackWorker, names: Sequence[str]) -> None:
             except SceneError:  # the attack of the frame reports it
                 continue
 
-    survey, _ = survey_streets(worker.detector, photographs(), t_star, until_found=True)
+    survey, _ = survey_streets(worker.detector, photographs(), t_star, until_found=True, classes=classes)
     if survey.pictures and survey.problem is not None:
         found = f"{survey.problem} (drivesem check --detector {config.detector})"
-        raise UsageError("--detector", "one that finds cars", found)
+        raise UsageError(
+            "--detector", f"one that finds {' or '.join(f'{name.lower()}s' for name in classes)}", found
+        )
 
 
 def _resolve_budget(config: AttackConfig) -> AttackConfig:
@@ -411,7 +415,8 @@ class AttackWorker:
     def _check_vehicles(self, identifier: str, scene: SceneIR) -> None:
         count, rows = len(scene.objects), TargetSelection.from_options(self.config.target_objects, None).objects
         if count == 0:
-            raise NoVehicleError(f"frame {identifier}", "a vehicle that can be de-rendered", "none")
+            kind = "vehicle or person" if self.config.moves_people else "vehicle"
+            raise NoVehicleError(f"frame {identifier}", f"a {kind} that can be de-rendered", "none")
         if rows is not None and rows[-1] >= count:
             raise NoVehicleError(
                 f"frame {identifier}", f"objects up to the {rows[-1]}th from 0", f"{count} of them"

@@ -237,7 +237,7 @@ def attack(
         norm: Norm of the change that scw keeps small.
         range: Region in which gradient-free methods sample: the bounds, or what `steps` steps can reach.
         early_stop: Stop at the first failure.
-        changes: Changes of vehicles with the budget street, with commas: leave, park, swap, load.
+        changes: Changes of objects with the budget street, with commas: leave, park, swap, load, emerge.
         mesh: File of the mesh that a vehicle changes to.
         target_objects: Rows that count as failures when lost, such as "0,2".
         target_classes: Classes in which failures count, such as "Car,Pedestrian".

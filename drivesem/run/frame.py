@@ -35,7 +35,15 @@ from drivesem.failures.kinds import OBJECT_KINDS, LabelledDetections
 from drivesem.run.feature_map import FailureMap
 from drivesem.run.labels import RESULT
 from drivesem.run.report import pictures
-from drivesem.run.results import BoxRecord, Coordinate, Failure, FrameResult, VehicleCounts, dump_frame
+from drivesem.run.results import (
+    BoxRecord,
+    ClassSummary,
+    Coordinate,
+    Failure,
+    FrameResult,
+    VehicleCounts,
+    dump_frame,
+)
 from drivesem.run.search_memory import MARGINS
 from scene_ir import files
 from scene_ir.errors import FormatError
@@ -442,14 +450,37 @@ def count_grades(results: Sequence[FrameResult]) -> dict[str, Any]:
     failures = [failure for r in results for failure in r.failures]
     return {
         "passes": sum(r.passes or 0 for r in results),
-        "grades": {str(grade): sum(map(has_grade(grade), failures)) for grade in Grade},
-        "kinds": {str(kind): sum(f.error == kind for f in failures) for kind in Kind},
+        **_count_failures(failures),
         "fidelity": {
             "trusted": sum(failure.count is not None and failure.is_trusted for failure in failures),
             "not_trusted": sum(not failure.is_trusted for failure in failures),
         },
         "frames_ungraded": sum(not r.graded for r in results),
         "grade_notes": dict(Counter(note for r in results for note in r.grade_notes)),
+    }
+
+
+def _count_failures(failures: Sequence[GradedFailure]) -> dict[str, dict[str, int]]:
+    """Count failures of at least each grade, and by kind."""
+    return {
+        "grades": {str(grade): sum(map(has_grade(grade), failures)) for grade in Grade},
+        "kinds": {str(kind): sum(f.error == kind for f in failures) for kind in Kind},
+    }
+
+
+def count_by_class(results: Sequence[FrameResult]) -> dict[str, ClassSummary]:
+    """Count judged objects and failures of each class that has any."""
+    judged = [(r.targets_benign[row].label, row in r.found_before) for r in results for row in r.judged]
+    failures = [failure for r in results for failure in r.failures]
+    present = {name for name, _ in judged} | {failure.label for failure in failures}
+    return {
+        name: ClassSummary(
+            sum(label == name for label, _ in judged),
+            sum(label == name and found for label, found in judged),
+            **_count_failures([failure for failure in failures if failure.label == name]),
+        )
+        for name in CLASSES
+        if name in present
     }
 
 
@@ -483,6 +514,7 @@ def count_objects(results: Sequence[FrameResult]) -> dict[str, Any]:
 
     return {
         "objects": VehicleCounts(sum(r.objects for r in results), judged, found),
+        "by_class": count_by_class(results),
         "missed_before": Proportion.from_counts(judged - found, judged),
         "lost_by_grade": {str(grade): Proportion.from_counts(lost(grade), found) for grade in Grade},
     }

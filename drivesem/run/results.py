@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from drivesem.data.classes import PEOPLE
 from drivesem.evaluation.coco import CocoScores
 from drivesem.evaluation.resampling import ClusteredShare, Proportion
 from drivesem.failures.feature_cells import CellVisit
@@ -205,6 +206,20 @@ class VehicleCounts:
 
 
 @dataclass(frozen=True, slots=True)
+class ClassSummary:
+    """Objects of one class, and failures in it."""
+
+    judged: int
+    """Judged objects."""
+    found_before: int
+    """Those that the detector finds before the attack."""
+    grades: dict[str, int]
+    """Failures of at least each grade."""
+    kinds: dict[str, int]
+    """Failures by kind."""
+
+
+@dataclass(frozen=True, slots=True)
 class RunSummary:
     """Summary of a run."""
 
@@ -270,6 +285,8 @@ class RunSummary:
     """Run time."""
     data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Files and label rows of the data set, and what became of them; empty for generated scenes."""
+    by_class: dict[str, ClassSummary] = dataclasses.field(default_factory=dict)
+    """Classes with judged objects or failures."""
     map: FailureMap = dataclasses.field(default_factory=FailureMap)
     """Which features were searched, what fails there, and what is known to hold."""
     rate: ClusteredShare | None = None
@@ -277,8 +294,14 @@ class RunSummary:
 
     @property
     def noun(self) -> str:
-        """What the objects are called: vehicles, unless the headline's class is people's."""
-        return "vehicle" if self.headline in ("Car", "Truck") else "object"
+        """What the objects are called: vehicles, unless people are among them."""
+        return "object" if {self.headline, *self.by_class} & {*PEOPLE} else "vehicle"
+
+    @property
+    def attacked_classes(self) -> tuple[str, ...]:
+        """Classes to list apart, where people and vehicles are both judged; else none."""
+        judged = {name in PEOPLE for name, one in self.by_class.items() if one.judged}
+        return tuple(self.by_class) if len(judged) == 2 else ()
 
     @property
     def frames_attacked(self) -> int:
@@ -310,6 +333,7 @@ class RunSummary:
             "broken": dataclasses.asdict(self.broken),
             "objects": dataclasses.asdict(self.objects),
             "missed_before": dataclasses.asdict(self.missed_before),
+            "by_class": {name: dataclasses.asdict(one) for name, one in self.by_class.items()},
             "map": self.map.to_json(),
             "rate": None if self.rate is None else dataclasses.asdict(self.rate),
             "lost_by_grade": {grade: dataclasses.asdict(share) for grade, share in self.lost_by_grade.items()},

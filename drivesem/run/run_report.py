@@ -431,7 +431,9 @@ def _load_summary(path: Path) -> RunSummary:
         plain |= {name: data[name] for name in ("frames_failed", "frames_not_attacked", *_OBJECT_FIELDS)}
         plain |= {name: data[name] for name in ("successes_paper", "successes_moved")}
         plain |= {name: data[name] for name in ("feasible_fraction", "queries", "seconds")}
-        plain |= {"params": data["params"]} | {name: data[name] for name in _GRADE_FIELDS}
+        plain |= {"by_class": data.get("by_class", {}), "params": data["params"]} | {
+            name: data[name] for name in _GRADE_FIELDS
+        }
         plain |= {name: _parse_scores(data[name]) for name in ("benign", "rerendered")}
         plain |= {f"attacked_{mode}": _parse_scores(data["attacked"][mode]) for mode in ("paper", "moved")}
         plain |= {name: data[f"{name}_by_class"] for name in ("lost_objects", "phantoms")}

@@ -111,7 +111,7 @@ async function settled(now) {
       const answer = await request("/notes", stateQuery());
       if (answer === null || now !== serial) return;
       const notes = await answer.json();
-      $("notes").textContent = notes.length ? `No car can do that: ${notes.join("; ")}` : "";
+      $("notes").textContent = notes.length ? `Not possible: ${notes.join("; ")}` : "";
       await fillMap(now);
     } catch (error) { complain(error); }
   }, 120);
@@ -227,8 +227,8 @@ function choose(car, x = null, y = null, redraw = true) {
   if (redraw) { refresh(); showDetections(); settled(serial); }
 }
 function carLine() {
-  if (!frame.cars.length) return element("p", {class: "soft small"}, "The scene has no vehicle that can be moved.");
-  const reset = element("button", {type: "button", title: "this vehicle as photographed"}, "reset");
+  if (!frame.cars.length) return element("p", {class: "soft small"}, "The scene has no object that can be moved.");
+  const reset = element("button", {type: "button", title: "this object as photographed"}, "reset");
   reset.addEventListener("click", () => restCar());
   return element("p", {class: "chosen-line"}, element("span", {id: "chosen"}), reset);
 }

@@ -274,6 +274,10 @@ def test_what_is_no_detector_of_cars(boxes: list[list[float]], scores: list[floa
 def test_no_cars_to_find_and_pictures_until_one_is_found() -> None:
     streets, _ = survey_streets(FixedDetections([CAR], [0.9], ("", "bus")), torch.zeros(2, 3, *IMAGE_HW), 0.5)
     assert streets.problem == "no class Car among , bus"
+    streets, _ = survey_streets(
+        FixedDetections([CAR], [0.9], ("Van", "Bus")), torch.zeros(1, 3, *IMAGE_HW), 0.5, classes=("Bus", "Van")
+    )
+    assert (streets.boxes, streets.problem) == (1, None)
     detector = FixedDetections([CAR, FAR], [0.9, 0.6])
     streets, _ = survey_streets(detector, torch.zeros(5, 3, *IMAGE_HW), 0.5, until_found=True)
     assert (streets.pictures, detector.calls) == (1, 1)

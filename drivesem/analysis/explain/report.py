@@ -187,7 +187,7 @@ def build_explain_notes(draws: int) -> list[str]:
 
 def exchange_note(names: Sequence[str]) -> str:
     """Name the frames that cannot be explained."""
-    return f"frames that fail by the exchange of vehicles alone: {', '.join(names)}"
+    return f"frames that fail by the exchange of objects alone: {', '.join(names)}"
 
 
 def build_explain_report(

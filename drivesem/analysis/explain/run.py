@@ -350,7 +350,7 @@ def _explain_failure(
     """
     theta, tracked, theta0 = frame.theta, evaluator.tracked[row], frame.objective.space.theta0
     if evaluator.occurs(evaluator.project(theta0))[row]:
-        return FailureExplanation(tracked.record, None, "the exchange of vehicles alone causes it"), None
+        return FailureExplanation(tracked.record, None, "the exchange of objects alone causes it"), None
     whole = evaluator.project(theta)
     draws = evaluator.choose_draws(whole, row) if tracked.certain else MIN_CHECK_DRAWS
     must_hold = tracked.certain and evaluator.holds(whole, row, draws)

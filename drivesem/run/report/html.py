@@ -99,7 +99,7 @@ def render_report(page: ReportPage, at: Path) -> str:
         glance_title=_glance_title([shot for _, _, shot in glance]),
         graded=[run for run in runs if grading.is_known(run.summary, run.frames)],
         failures=any(result.failures for run in runs for result in run.frames),
-        kinds=[] if several else grading.tabulate_kinds(first.frames),
+        kinds=[] if several else grading.tabulate_kinds(first.frames, first.summary.attacked_classes or ("",)),
         grades=[str(grade) for grade in reversed(Grade)],
         rules=grading.build_grade_rules(first.grade_requirements),
         unknown=grading.UNKNOWN,

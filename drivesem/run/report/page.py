@@ -351,7 +351,7 @@ class GradeRule:
 
 @dataclass(frozen=True, slots=True)
 class FailureKindRow:
-    """Failures of one kind."""
+    """Failures of one kind, in one class or in all."""
 
     name: str
     """The kind."""
@@ -359,6 +359,8 @@ class FailureKindRow:
     """Its meaning."""
     counts: tuple[int, ...]
     """Number of failures by highest grade, highest first."""
+    label: str = ""
+    """The class; empty: all classes."""
 
     @property
     def total(self) -> int:
@@ -449,11 +451,22 @@ def format_second_opinion(failure: Failure, agreement: SecondOpinion | None) -> 
     return "" if agreement is None else agreement.describe(failure.error)
 
 
-def tabulate_kinds(frames: Sequence[FrameResult]) -> list[FailureKindRow]:
-    """Tabulate failures by kind and highest grade, followed by those of no kind."""
+def tabulate_kinds(frames: Sequence[FrameResult], labels: Sequence[str] = ("",)) -> list[FailureKindRow]:
+    """Tabulate failures by kind and highest grade, followed by those of no kind.
+
+    Args:
+        frames: Frames of a run.
+        labels: Classes to tabulate one after the other; "" stands for all together.
+    """
     failures = [failure for result in frames for failure in result.failures if failure.grade is not None]
     rows = [
-        FailureKindRow(name, meaning, _count_by_grade([f for f in failures if f.error == kind]))
+        FailureKindRow(
+            name,
+            meaning,
+            _count_by_grade([f for f in failures if f.error == kind and label in ("", f.label)]),
+            label,
+        )
+        for label in labels
         for kind, name, meaning in (
             *((kind, KINDS[kind], _MEANINGS[kind]) for kind in Kind),
             (None, NO_KIND, _NO_KIND_MEANING),

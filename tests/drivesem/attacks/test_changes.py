@@ -210,7 +210,9 @@ def test_a_fraction_of_the_passes_goes_into_proposals() -> None:
 
 @pytest.mark.parametrize("text", ["", "fly", "leave,leave", "leave,"])
 def test_unknown_changes_are_named(text: str) -> None:
-    with pytest.raises(FormatError, match="--changes: expected each at most once of leave, park, swap, load"):
+    with pytest.raises(
+        FormatError, match="--changes: expected each at most once of leave, park, swap, load, emerge"
+    ):
         parse_vehicle_changes(text)
 
 

@@ -286,7 +286,7 @@ def test_frames_that_fail_by_the_exchange_alone_are_left_out(run: Path, scene: S
     assert (data["frames"], data["frames_failed"]) == (1, {})
     assert data["rows"] == alone["rows"]
     page = (run / "explain" / "explain.md").read_text()
-    assert "Left out: frames that fail by the exchange of vehicles alone: demo-001, demo-002." in page
+    assert "Left out: frames that fail by the exchange of objects alone: demo-001, demo-002." in page
     for name, theta in (("demo-001", 0), ("demo-002", 1)):
         found = load_record(run / "explain" / "frames" / name / "explain.json", Explanation, SCHEMA)
         assert all(found.benign.occurs)
@@ -299,7 +299,7 @@ def test_frames_that_fail_by_the_exchange_alone_are_left_out(run: Path, scene: S
             "explain", "--run", run, "--workers", "1", "--frame", "demo-001", "--points", "4", code=2
         ).err.split()
     )
-    assert error_line.endswith("found frames that fail by the exchange of vehicles alone: demo-001")
+    assert error_line.endswith("found frames that fail by the exchange of objects alone: demo-001")
 
 
 def test_bad_input(run: Path, tmp_path: Path) -> None:

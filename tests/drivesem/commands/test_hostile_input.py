@@ -301,6 +301,8 @@ def test_a_detector_without_detections_is_not_attacked(tmp_path: Path, monkeypat
     assert line.startswith("--detector: expected one that finds cars, found no car")
     assert "no car with a score of 0.5 or more in 2 pictures (no detection at all)" in line
     assert not (tmp_path / "run" / "metrics.json").exists()
+    line = refusal(*words, "--limit", "2", "--people", "--out", tmp_path / "people")
+    assert "one that finds cars or trucks or pedestrians or cyclists, found no car or" in line
     # One photograph in which nothing is found says nothing of the detector.
     assert main([*words, "--limit", "1", "--out", str(tmp_path / "one")]) == 0
 

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from drivesem.attacks.labels import hidden_shares
 from scene_ir.derender import people, upright
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.derender.silhouette import render_silhouettes
+from scene_ir.errors import RangeError
+from scene_ir.exchange import CHANGE_KEY, relocate_person
 from scene_ir.geometry import project
 from scene_ir.io import load_scene, save_scene
 from scene_ir.render.compositor import Compositor
@@ -157,6 +160,25 @@ def test_a_saved_scene_holds_its_people(scene, tmp_path):
     assert torch.equal(loaded.objects.category, scene.objects.category)
     moved = [Compositor(one).render(shift(one, 0.5)).image for one in (scene, loaded)]
     assert float((moved[0] - moved[1]).abs().max()) < 0.01
+
+
+def test_a_person_stands_behind_a_vehicle_as_if_photographed_there(scene):
+    ahead = scene.objects.translation[0] + torch.tensor([-1.0, 0.0, 3.5])
+    there = relocate_person(scene, 1, ahead, 0)
+    assert there.provenance[CHANGE_KEY] == "objects[1] stands behind objects[0]"
+    assert torch.equal(there.origin.objects.translation, scene.objects.translation)
+    compositor = Compositor(there)
+    drawn = compositor.render(there)
+    shares = hidden_shares(drawn)
+    assert 0.0 < shares[1] < 1.0
+    assert shares[0] == 0.0
+    assert float((compositor.render(there.origin).image - scene.photograph).abs().max()) < 1e-3
+    feet = project(ahead[None], scene.camera.matrix)[0]
+    crop = there.objects.source[1].foreground
+    lowest = crop.y0 + int((crop.values[3] > 0.5).any(dim=1).nonzero().max())
+    assert lowest == pytest.approx(float(feet[1]), abs=3)
+    with pytest.raises(RangeError, match="a row of a person or cyclist"):
+        relocate_person(scene, 0, ahead, 0)
 
 
 @pytest.mark.parametrize(
