@@ -96,7 +96,8 @@ class FailureMap:
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object."""
         data = asdict(self)
-        return data | {"cells": list(data["cells"])}
+        cells = [cell | {"failures": [list(pair) for pair in cell["failures"]]} for cell in data["cells"]]
+        return data | {"cells": cells}
 
     @property
     def columns(self) -> list[tuple[str, str]]:

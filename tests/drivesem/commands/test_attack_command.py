@@ -369,7 +369,8 @@ def test_methods_are_those_that_need_no_gradient() -> None:
         "placebo",
         "corners",
         "climb",
-    }  # the last takes gradients where there are any
+        "learn",
+    }  # the last two take gradients where there are any
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ REFUSALS = [
     ("attack --changes leave --method climb", "--changes: expected --budget street, found --budget paper"),
     (
         "attack --changes leave --budget street",
-        "--changes: expected only with --method climb, corners, found --method",
+        "--changes: expected only with --method climb, corners, learn, found --method",
     ),
     ("attack --mesh car.obj --method climb --budget street", "--mesh: expected --changes, found none"),
     ("attack --changes park --mesh no.obj --method climb --budget street", "no.obj: expected a mesh file"),

@@ -297,18 +297,21 @@ def test_another_grade_kind_or_count(run: Path) -> None:
 
     found = spoil(grade="certain")
     files_changed = {"result.json", "result.json: failures"}
-    assert set(found) == {*files_changed, "failures[0].grade", "metrics.json: grades.certain"}
+    grades = {"metrics.json: grades.certain", "metrics.json: by_class.Car.grades.certain"}
+    assert set(found) == {*files_changed, "failures[0].grade", *grades}
     assert (found["failures[0].grade"]["expected"], found["failures[0].grade"]["found"]) == (
         "certain",
         "threshold",
     )
     found = spoil(error="missed")
-    kinds = {f"metrics.json: kinds.{kind}" for kind in ("background", "missed")}
+    kinds = {
+        f"metrics.json: {of}kinds.{kind}" for of in ("", "by_class.Car.") for kind in ("background", "missed")
+    }
     assert set(found) == {*files_changed, "failures[0].error", *kinds}
     # As many draws as a certificate needs, and the grade that would follow from them.
     held = {"before": 16, "before_draws": 16, "after": 16, "after_draws": 16}
     found = spoil(count={**asdict(failure.count), **held}, grade="certain")
-    assert set(found) == {*files_changed, "failures[0].count", "metrics.json: grades.certain"}
+    assert set(found) == {*files_changed, "failures[0].count", *grades}
     verify(run, code=0)
 
 
