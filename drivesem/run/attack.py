@@ -72,7 +72,7 @@ SECOND_DETECTORS = ("yolov3-slim", "squeezedet")
 """Shipped detectors of different architectures; the one not under attack re-tests confirmed failures."""
 GRADIENT_FREE_FALLBACK = "climb"
 """Default method for detectors without a gradient: of methods without one, it finds most certain failures."""
-_METHODS_WITHOUT_GRADIENT = (*GRADIENT_FREE_METHODS, "corners", GRADIENT_FREE_FALLBACK)
+_METHODS_WITHOUT_GRADIENT = (*GRADIENT_FREE_METHODS, "corners", GRADIENT_FREE_FALLBACK, "learn")
 SURVEYED_FRAMES = 8
 """Photographs of which one must have a car that the detector finds."""
 _FIXED_PASSES = 3
