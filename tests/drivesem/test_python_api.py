@@ -498,7 +498,7 @@ def test_a_detector_without_gradient_gets_the_commands_method(
     for detector in (Blinking(), "any"):
         with pytest.raises(ZeroDivisionError):
             ds.attack(scene, detector, params="color", confirm=False)
-        every = "method: expected one of random, halton, cma-es, corners, climb for"
+        every = "method: expected one of random, halton, cma-es, corners, climb, learn for"
         with pytest.raises(UsageError, match=every):
             ds.attack(scene, detector, params="color", confirm=False, method="apgd")
     assert methods == ["climb", "climb"]

@@ -334,7 +334,7 @@ def test_what_cannot_grade_is_refused(
     [
         (
             ["--method", "apgd"],
-            "--method: expected one of random, halton, cma-es, corners, climb for any, which has no",
+            "--method: expected one of random, halton, cma-es, corners, climb, learn for any, which has no",
         ),
         (["--method", "halton", "--objective", "confidence"], "--objective: expected one of objectness, hide"),
         (["--queries", "3"], "--queries: expected only with --method random, halton"),
