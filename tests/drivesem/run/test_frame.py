@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import weakref
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from detectors.base import Detector
 from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.registry import load_detector
+from drivesem.attacks.methods.learned import Learn, MarginModel
 from drivesem.config.commands import AttackConfig
 from drivesem.failures.feature_cells import CellVisit
 from drivesem.run.attack import AttackWorker
-from drivesem.run.frame import estimate_rate
+from drivesem.run.frame import estimate_rate, write_frame
+from drivesem.run.search_memory import MARGINS, read_margin_rows
+from drivesem.scenes.sources import NoVehicleError
 from drivesem.synth.demo import demo_scene
+from scene_ir import files
 
 
-@pytest.mark.parametrize("options", [{"method": "climb", "passes": 40}, {"method": "random", "queries": 4}])
-def test_layers_are_released_after_a_frame(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("options", [{"method": "learn", "passes": 40}, {"method": "random", "queries": 4}])
+def test_layers_are_released_after_a_frame(
+    options: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     made: list[weakref.ref[ReferencePass]] = []
     megabytes: list[float] = []
     original_run = ReferencePass.run
@@ -40,6 +48,35 @@ def test_layers_are_released_after_a_frame(options: dict[str, Any], monkeypatch:
     assert 0 < max(megabytes) <= 200
     assert [one() for one in made] == [None] * len(made)
     assert attacked.objective.reference_mb == 0
+    write_frame(attacked, tmp_path / "demo-000")
+    learns = options["method"] == "learn"
+    assert (tmp_path / "demo-000" / MARGINS).is_file() is learns
+    if learns:
+        assert len(read_margin_rows(tmp_path / "demo-000" / MARGINS)) > 20
+
+
+def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    models: list[MarginModel | None] = []
+
+    def stop(worker: AttackWorker, identifier: str, scene: object) -> None:
+        assert isinstance(worker.method, Learn)
+        models.append(worker.method.model)
+        raise NoVehicleError("frame", "a vehicle", "none")
+
+    monkeypatch.setattr(AttackWorker, "attack_scene", stop)
+    worker = AttackWorker.from_config(
+        AttackConfig(params="translate", method="learn"), load_detector("squeezedet")
+    )
+    for number in range(5):
+        assert not worker.attack_frame("demo-000", tmp_path)
+        folder = tmp_path / "frames" / f"{number:03}"
+        folder.mkdir(parents=True)
+        files.write_npz(
+            folder / MARGINS, {"rows": np.random.default_rng(number).random((60, 7)).astype(np.float32)}
+        )
+    assert [model is None for model in models] == [True, True, True, True, False]
 
 
 def sampled(found: tuple[int, ...], *visits: tuple[int, int, int], attacked: bool = True) -> Any:
