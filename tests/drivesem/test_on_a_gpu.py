@@ -116,7 +116,7 @@ def test_a_classifier_is_attacked_as_on_the_processor(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("layers", ["all", pytest.param("last", marks=pytest.mark.slow)])
 def test_a_classifier_learns_what_it_learns_on_the_processor(layers: str, tmp_path: Path) -> None:
-    words = ["classify", "train", "--layers", layers, "--limit", "8", "--views", "forward", "--batch", "4"]
+    words = ["classify", "train", "--layers", layers, "--limit", "12", "--views", "forward", "--batch", "6"]
     here, there = on_both([*words, "--epochs", "1", "--json"], tmp_path)
     trainings = [json.loads((out / "training.json").read_text()) for out in (here, there)]
     for one, other in zip(trainings[0]["epochs"], trainings[1]["epochs"], strict=True):
