@@ -10,7 +10,8 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -37,7 +38,7 @@ from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from drivesem.reporting.web import render_page
 from drivesem.run.driver import FrameAnalyser, analyse_runs
 from drivesem.run.export import PACKAGE, GateSource, open_gate_package, write_lossy_frame
-from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
+from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs, map_failing_frames, name_frames
 from drivesem.run.folder import (
     FRAMES,
     PRESENTATION,
@@ -53,16 +54,17 @@ from scene_ir.io import to_uint8
 
 _WRITTEN = ("gate.json", "gate.md", "gate.csv", "gate.xml", "gate.html", "runs")
 _FREE = (*PRESENTATION, "runs", "tolerance", "bootstrap", "allow_empty")
-HOLE, KIND, ALL, PHANTOMS = "hole", "kind", "all", "phantoms"
+HOLE, CELL, KIND, ALL, PHANTOMS = "hole", "cell", "kind", "all", "phantoms"
 _MAX_PRINTED = 12
-"""Holes in the table on a terminal; the files have all."""
+"""Holes and cells in the table on a terminal; the files have all."""
 _NOTE = (
     "Lost: share of samples around a certain failure in which a detector misses the object; both detectors get "
     "the same pictures, and samples in which the object is hidden, too small or faint do not count. Phantoms: share "
     "of these samples with a detection on nothing, anywhere in the picture. In brackets: 95 % paired bootstrap "
-    "interval, over samples for a hole, and over holes for kinds, all, and phantoms. p: exact sign test of the "
+    "interval, over samples for a hole, and over holes for cells, kinds, all, and phantoms. A cell has the samples "
+    "around the failures that lie in it on the run's map. p: exact sign test of the "
     "samples in which only one detector fails, with Holm's correction over all rows. A row grew if the difference "
-    "exceeds the tolerance, its interval lies above 0, and p is below 0.05."
+    "exceeds the tolerance, its interval lies above 0, and p is below 0.05; it fell if the same holds the other way."
 )
 _NO_SAMPLES = "no sample counts around any certain failure"
 _SIDES = ("unchanged", "changed")
@@ -116,9 +118,9 @@ class GateRow:
     """Failure rates of two detectors, compared."""
 
     level: str
-    """HOLE, KIND, ALL or PHANTOMS."""
+    """HOLE, CELL, KIND, ALL or PHANTOMS."""
     hole: str
-    """Name of the hole, or of the kind."""
+    """Name of the hole, of the cell, or of the kind."""
     before: float
     """Share of samples in which the old detector fails."""
     after: float
@@ -137,6 +139,13 @@ class GateRow:
     """Number of holes."""
     grew: bool
     """Whether the rate grew by more than the tolerance and more than chance explains."""
+    fell: bool
+    """Whether it fell by more than the tolerance and more than chance explains."""
+
+    @property
+    def change(self) -> str:
+        """grew, fell or same."""
+        return "grew" if self.grew else "fell" if self.fell else "same"
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object."""
@@ -167,16 +176,18 @@ def _run_gate(config: GateConfig, sources: Sequence[GateSource]) -> AnalysisRepo
     )
     draws = DRAWS if config.bootstrap is None else config.bootstrap
     pairs = {name: result.pairs for name, result in results.items()}
+    failing = map_failing_frames(name_frames(runs))
     counts = {
         "frames": sum(source.frames for source in sources),
         "frames_attacked": sum(source.frames_attacked for source in sources),
         "frames_ungraded": sum(not frame.result.graded for run in runs for frame in run.frames),
         "frames_compared": len(pairs),
         "failures": sum(map(len, pairs.values())),
+        "frames_without_record": failing.frames_without_record,
     }
     report = build_gate_report(
         out,
-        compute_gate_rows(pairs, config.tolerance, draws, config.seed),
+        compute_gate_rows(pairs, config.tolerance, draws, config.seed, failing.cells_by_failure()),
         GateFacts(
             about={
                 "runs": list(config.runs),
@@ -219,6 +230,8 @@ def _describe_scope(counts: Mapping[str, int]) -> str:
     text += f" ({frames - attacked} of {frames} had nothing to attack)" if attacked < frames else ""
     if ungraded:
         text += f"; the failures of {format_count(ungraded, 'frame')} have no grade: attack without --no-grade"
+    if counts["frames_without_record"]:
+        text += f"; {format_count(counts['frames_without_record'], 'frame')} without a record of the search: in no cell"
     return text
 
 
@@ -375,40 +388,72 @@ def _draw_paired_samples(
 
 
 def compute_gate_rows(
-    pairs_by_frame: Mapping[str, Sequence[PairedSamples]], tolerance: float, draws: int, seed: int
+    pairs_by_frame: Mapping[str, Sequence[PairedSamples]],
+    tolerance: float,
+    draws: int,
+    seed: int,
+    cells: Mapping[tuple[str, int], str] = MappingProxyType({}),
 ) -> list[GateRow]:
-    """Compare failure rates by hole, by kind of failure, in total, and of phantoms.
+    """Compare failure rates by hole, by cell of the map, by kind of failure, in total, and of phantoms.
 
     Args:
         pairs_by_frame: Samples per failure, by frame; those without samples get no row.
         tolerance: Largest acceptable growth of a rate.
         draws: Bootstrap draws.
         seed: Seed of the bootstrap.
+        cells: Cell of the map by frame and object; failures that lack one are in no row of a cell.
 
     Returns:
-        Rows of holes, those that grew most first; then of kinds, of all holes, and of phantoms.
+        Rows of holes, those that grew most first; of cells, in the same order; then of kinds, of all holes, and of
+        phantoms.
     """
-    named = [(_hole_name(frame, p), p) for frame, pairs in pairs_by_frame.items() for p in pairs if p.before]
-    hole_rows = [_compute_row(HOLE, name, [pair], tolerance, draws, seed) for name, pair in named]
-    hole_rows.sort(key=lambda row: (-row.difference, row.hole))
-    kinds = sorted({pair.error for _, pair in named})
-    kind_rows = [
-        _compute_row(KIND, kind, [pair for _, pair in named if pair.error == kind], tolerance, draws, seed)
-        for kind in kinds
+    named: _Group = []
+    by_cell: dict[str, _Group] = {}
+    by_kind: dict[str, _Group] = {}
+    for frame, pairs in pairs_by_frame.items():
+        for pair in pairs:
+            if pair.before:
+                named.append((_hole_name(frame, pair), pair))
+                by_kind.setdefault(pair.error, []).append(named[-1])
+                if pair.index is not None and (frame, pair.index) in cells:
+                    by_cell.setdefault(cells[frame, pair.index], []).append(named[-1])
+    groups = {(HOLE, name): [(name, pair)] for name, pair in named}
+    groups |= {(CELL, cell): group for cell, group in by_cell.items()}
+    groups |= {(KIND, kind): by_kind[kind] for kind in sorted(by_kind)}
+    groups |= {(ALL, ALL): named} if named else {}
+    phantoms = [
+        (name, replace(pair, before=pair.phantoms_before, after=pair.phantoms_after))
+        for name, pair in named
+        if pair.phantoms_before
     ]
-    pairs = [pair for _, pair in named]
-    phantoms = [replace(p, before=p.phantoms_before, after=p.phantoms_after) for p in pairs if p.phantoms_before]
-    rows = [*hole_rows, *kind_rows]
-    rows += [_compute_row(ALL, ALL, pairs, tolerance, draws, seed)] if pairs else []
-    rows += [_compute_row(PHANTOMS, PHANTOMS, phantoms, tolerance, draws, seed)] if phantoms else []
-    # The row of a kind with one hole, and that of all holes of one kind, repeat another row: no further test.
-    tested = [
-        row.p
-        for row in rows
-        if not (row.level == KIND and row.holes == 1) and not (row.level == ALL and len(kinds) == 1)
+    groups |= {(PHANTOMS, PHANTOMS): phantoms} if phantoms else {}
+    worse, better = (_correct_p_values(groups, alternative) for alternative in ("greater", "less"))
+    rows = [
+        _compute_row(key, [pair for _, pair in group], (worse[key], better[key]), tolerance, draws, seed)
+        for key, group in groups.items()
     ]
-    adjusted = {p: corrected for p, corrected in zip(tested, holm(tested), strict=True) if corrected is not None}
-    return [replace(row, p=adjusted[row.p], grew=row.grew and adjusted[row.p] < 1 - LEVEL) for row in rows]
+    order = (HOLE, CELL)
+    ranked = sorted(
+        (r for r in rows if r.level in order), key=lambda r: (order.index(r.level), -r.difference, r.hole)
+    )
+    return ranked + [row for row in rows if row.level not in order]
+
+
+_Group = list[tuple[str, PairedSamples]]
+"""Samples by name of the hole."""
+
+
+def _correct_p_values(
+    groups: Mapping[tuple[str, str], _Group], alternative: Literal["greater", "less"]
+) -> dict[tuple[str, str], float]:
+    """Return the p-value of each row, with Holm's correction over all rows. Rows of the same holes, such as those of
+    a cell with a single one, are one test.
+    """
+    tests = {key: (key[0] == PHANTOMS, frozenset(name for name, _ in group)) for key, group in groups.items()}
+    pairs = {tests[key]: [pair for _, pair in group] for key, group in groups.items()}
+    corrected = holm([_sign_test(group, alternative) for group in pairs.values()])
+    by_test = {test: p for test, p in zip(pairs, corrected, strict=True) if p is not None}
+    return {key: by_test[test] for key, test in tests.items()}
 
 
 def _hole_name(frame: str, pair: PairedSamples) -> str:
@@ -416,9 +461,14 @@ def _hole_name(frame: str, pair: PairedSamples) -> str:
 
 
 def _compute_row(
-    level: str, name: str, pairs: Sequence[PairedSamples], tolerance: float, draws: int, seed: int
+    key: tuple[str, str],
+    pairs: Sequence[PairedSamples],
+    p_values: tuple[float, float],
+    tolerance: float,
+    draws: int,
+    seed: int,
 ) -> GateRow:
-    """Compute a row, with p uncorrected and `grew` without the test."""
+    """Compute the row of a level and name. p_values: corrected, that the new detector is worse, and better."""
     if len(pairs) == 1:  # of one hole, resample the samples
         before, after = (np.array(side, np.float64) for side in (pairs[0].before, pairs[0].after))
         count = np.ones(len(before))
@@ -431,18 +481,20 @@ def _compute_row(
     assert rates.first is not None
     assert rates.second is not None
     assert rates.difference is not None
+    worse, better = (p < 1 - LEVEL for p in p_values)
     return GateRow(
-        level=level,
-        hole=name,
+        level=key[0],
+        hole=key[1],
         before=rates.first,
         after=rates.second,
         difference=rates.difference,
         low=rates.low,
         high=rates.high,
-        p=_sign_test(pairs),
+        p=p_values[0],
         samples=sum(len(pair.before) for pair in pairs),
         holes=len(pairs),
-        grew=rates.difference > tolerance and (rates.low is None or rates.low > 0),
+        grew=worse and rates.difference > tolerance and (rates.low is None or rates.low > 0),
+        fell=better and -rates.difference > tolerance and (rates.high is None or rates.high < 0),
     )
 
 
@@ -455,16 +507,16 @@ def _compare_rates(
     return difference
 
 
-def _sign_test(pairs: Sequence[PairedSamples]) -> float:
+def _sign_test(pairs: Sequence[PairedSamples], alternative: Literal["greater", "less"]) -> float:
     """Return the exact one-sided p-value over the samples in which only one detector fails (McNemar 1947): if both
-    were equally good, either would fail with even odds.
+    were equally good, either would fail with even odds. alternative: the new one fails more often, or less.
     """
     from scipy.stats import binomtest  # on use: it takes a third of a second to load
 
     discordant = [after for p in pairs for before, after in zip(p.before, p.after, strict=True) if before != after]
     if not discordant:
         return 1.0
-    return float(binomtest(sum(discordant), len(discordant), alternative="greater").pvalue)
+    return float(binomtest(sum(discordant), len(discordant), alternative=alternative).pvalue)
 
 
 @dataclass(frozen=True, slots=True)
@@ -525,8 +577,10 @@ def build_gate_report(out: Path, rows: Sequence[GateRow], facts: GateFacts) -> A
     if failed:
         notes.append(f"{format_count(len(failed), 'frame')} could not be compared, so the gate is not passed.")
     hole_rows = [row for row in rows if row.level == HOLE]
-    other_rows = [row for row in rows if row.level != HOLE]
-    ordered = [*other_rows, *hole_rows]
+    cell_rows = [row for row in rows if row.level == CELL]
+    other_rows = [row for row in rows if row.level not in (HOLE, CELL)]
+    ordered = [*other_rows, *cell_rows, *hole_rows]
+    printed = [*other_rows, *cell_rows[:_MAX_PRINTED], *hole_rows[:_MAX_PRINTED]]
     files.write_text(out / "gate.xml", format_junit(rows, failed, verb, "" if allowed else why_empty, why_empty))
     kinds = sum(row.level == KIND for row in rows)
     distinct = [
@@ -551,7 +605,7 @@ def build_gate_report(out: Path, rows: Sequence[GateRow], facts: GateFacts) -> A
         data={**data, "frames_failed": {**failed}},
         csv_tables={"gate": [_csv_row(row) for row in rows]} if rows else {},
         tables=[_build_table(title, ordered, verb)],
-        printed_tables=[_build_table(title, [*other_rows, *hole_rows[:_MAX_PRINTED]], verb)] if rows else [],
+        printed_tables=[_build_table(title, printed, verb)] if rows else [],
         notes=notes,
         failed=failed,
         failure_text="could not be compared",
@@ -573,7 +627,7 @@ def _describe_case(row: GateRow, verb: str, close_up: HolePictures | None) -> di
 
 
 def _row_name(row: GateRow) -> str:
-    names = {ALL: "all failures", PHANTOMS: "phantoms", KIND: f"all {row.hole}"}
+    names = {ALL: "all failures", PHANTOMS: "phantoms", KIND: f"all {row.hole}", CELL: f"cell {row.hole}"}
     return names.get(row.level, row.hole)
 
 
@@ -636,7 +690,7 @@ def _build_table(title: str, rows: Sequence[GateRow], verb: str) -> ReportTable:
             _format_difference(row),
             "<0.001" if row.p < 0.0005 else f"{row.p:.3f}",
             str(row.samples),
-            "grew" if row.grew else "",
+            row.change,
         )
         for row in rows
     )

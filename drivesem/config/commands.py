@@ -306,6 +306,8 @@ class HolesConfig(TrustOption, FrameCommandConfig):
 
     runs: RunFolders = ()
     """Folders of runs of drivesem attack."""
+    limit: Count | None = None
+    """Number of certain failures, in turn from different failing cells of the runs' map (default: all)."""
     samples: Annotated[int, at_least(24, "which a rule needs")] = 96
     """Samples around each failure, each evaluated once with nuisances."""
     fresh: Count = 32

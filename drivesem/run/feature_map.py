@@ -58,7 +58,12 @@ class MapCell:
 
     def describe(self) -> str:
         """Such as `under 40 px, low contrast, left, dark: 3 certain of 12 objects`."""
-        return f"{', '.join(self.where.values())}: {self.finding}"
+        return f"{self.name}: {self.finding}"
+
+    @property
+    def name(self) -> str:
+        """Such as `under 40 px, low contrast, left, dark`."""
+        return ", ".join(self.where.values())
 
     @property
     def finding(self) -> str:
@@ -98,6 +103,10 @@ class FailureMap:
         data = asdict(self)
         cells = [cell | {"failures": [list(pair) for pair in cell["failures"]]} for cell in data["cells"]]
         return data | {"cells": cells}
+
+    def cells_by_failure(self) -> dict[tuple[str, int], str]:
+        """Return the name of its cell for each certain failure, given as frame and number of the object."""
+        return {failure: cell.name for cell in self.cells for failure in cell.failures}
 
     @property
     def columns(self) -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,9 @@ from drivesem.failures.grading import Grader, GradingInput
 from drivesem.failures.kinds import OBJECT_KINDS, Fault
 from drivesem.failures.neighbourhood import Neighbourhood
 from drivesem.failures.nuisances import Nuisances
+from drivesem.run.feature_map import FailureMap
 from drivesem.run.folder import CONFIG, FRAMES, result_settings
-from drivesem.run.frame import certain_losses, count_grades, objective_grading_input
+from drivesem.run.frame import build_map, certain_losses, count_grades, objective_grading_input
 from drivesem.run.labels import MANIFEST, RESULT, list_manifest_frames
 from drivesem.run.lock import is_locked_elsewhere
 from drivesem.run.records import from_json
@@ -217,6 +218,26 @@ def _load_run_frame(folder: Path) -> RunFrame:
         if not path.is_file():
             raise FormatError(str(path), "a picture of the run", "none")
     return RunFrame(folder, load_frame(folder / RESULT), pictures)
+
+
+def name_frames(runs: Sequence[AttackRun]) -> dict[str, tuple[AttackRun, RunFrame]]:
+    """Return the frames of runs by name, which starts with that of the run if there are several."""
+    return {
+        f"{run.name}/{frame.result.identifier}" if len(runs) > 1 else frame.result.identifier: (run, frame)
+        for run in runs
+        for frame in run.frames
+    }
+
+
+def map_failing_frames(frames: Mapping[str, tuple[AttackRun, RunFrame]]) -> FailureMap:
+    """Build one map of those frames of runs that have certain failures: all failing cells, as a gate's package has no
+    other frames.
+
+    Args:
+        frames: Frames as `name_frames` returns them; the map has these names.
+    """
+    results = [replace(frame.result, identifier=name) for name, (_, frame) in frames.items()]
+    return build_map([result for result in results if certain_losses(result)])
 
 
 def rebuild_objective(

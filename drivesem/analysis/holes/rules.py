@@ -215,6 +215,8 @@ class FailureWithRule:
     """Its rule."""
     fresh: FeatureSamples
     """Further samples inside the rule."""
+    cell: str | None = None
+    """Cell of the map; None without a record of the search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,6 +275,8 @@ class HoleFailure:
     """Its kind."""
     grade: str
     """Its grade."""
+    cell: str | None
+    """Its cell of the map; None without a record of the search."""
 
     @property
     def text(self) -> str:
@@ -313,6 +317,11 @@ class Hole:
     recheck: RuleRecheck | None = None
     """Test of the failure rate; None without --recheck, or without fresh samples."""
 
+    @property
+    def cells(self) -> list[str]:
+        """Cells of the map that its failures lie in."""
+        return list(dict.fromkeys(failure.cell for failure in self.failures if failure.cell is not None))
+
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object."""
         return {
@@ -332,6 +341,7 @@ class Hole:
             },
             "kitti": self.kitti,
             "failures": [asdict(failure) for failure in self.failures],
+            "cells": self.cells,
             "frames": list(self.frames),
         }
 
@@ -541,7 +551,7 @@ def _build_hole(
         lost=_mean_probability([one.failure.lost for one in members]),
         kitti=kitti_shares(where),
         failures=tuple(
-            HoleFailure(frame, index, one.failure.label, one.failure.error, one.failure.grade)
+            HoleFailure(frame, index, one.failure.label, one.failure.error, one.failure.grade, one.cell)
             for (frame, index), one in group
         ),
         frames=tuple(dict.fromkeys(frame for (frame, _), _ in group)),

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import time
 from abc import ABC
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from detectors.types import CLASSES
 from drivesem.analysis.holes.rules import (
     ContrastSamples,
     FailureKey,
-    FailureRule,
     FailureSamples,
     FailureWithRule,
     FeatureSamples,
@@ -37,7 +37,8 @@ from drivesem.failures.rules import Floats, Intervals, contains
 from drivesem.reporting.plots import PLOT_COLOURS, PLOT_STYLE, write_figure
 from drivesem.reporting.tables import AnalysisReport, Console, ReportTable, format_count, progress_bar
 from drivesem.run.driver import FrameAnalyser, K, analyse_runs
-from drivesem.run.finished import AttackRun, RebuiltFrame, load_runs
+from drivesem.run.feature_map import FailureMap
+from drivesem.run.finished import AttackRun, RebuiltFrame, RunFrame, load_runs, map_failing_frames, name_frames
 from drivesem.run.folder import (
     FRAMES,
     PRESENTATION,
@@ -58,6 +59,8 @@ _RECHECK_TRIES = 20
 
 Rules = dict[str, dict[int, Intervals]]
 """Rules of a run's failures, by frame and object."""
+ChosenObjects = dict[str, set[int]]
+"""Objects of a run whose failures are sampled, by frame; none in frames that only serve as contrast."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,30 +92,41 @@ def run_holes(config: HolesConfig) -> AnalysisReport:
 
     Raises UsageError or SceneError for bad input.
     """
-    runs = load_runs(config.runs, config.limit, "RUN")
+    runs = load_runs(config.runs, setting="RUN")
     out = resolve_output_folder(config.out, runs[0].folder / "holes")
     for run in runs:
         load_trusted_config(run.folder, config.trust, "RUN")  # before anything is written
     claim_folder(out, config, _WRITTEN, _FREE)
-    _print_workload(runs, config)
-    chosen = [(run, _choose_frames(run, config)) for run in runs]
-    title = "sampling around failures of"
-    frames, failed = analyse_runs(chosen, partial(HolesAnalyser, config), out / "runs", config, title)
+    named = name_frames(runs)
+    failing = map_failing_frames(named)
+    cells = failing.cells_by_failure()
+    chosen = _choose_failures(named, cells, config)
+    _print_workload(runs, chosen, config)
+    frames, failed = analyse_runs(
+        [(run, list(chosen[run.name])) for run in runs],
+        partial(HolesAnalyser, config, chosen),
+        out / "runs",
+        config,
+        "sampling around failures of",
+    )
     failures = {(name, one.index): one for name, frame in frames.items() for one in frame.around}
     with progress_bar(Console(stderr=True), hidden=not failures) as progress:
         rules = fit_rules(frames, progress)
+    rules_by_run: dict[str, Rules] = {run.name: {} for run in runs}
+    for (name, index), failure in failures.items():
+        run, frame = named[name]
+        if failure.samples.margins:
+            rules_by_run[run.name].setdefault(frame.result.identifier, {})[index] = rules[name, index].where
     passes = sum(frame.passes for frame in frames.values())
     stages = {"fresh": ExtraSamples.fresh(config.samples, config.fresh)}
     if config.recheck is not None:
         stages["rechecks"] = ExtraSamples.recheck(config.recheck)
     samples_by_stage: dict[str, dict[FailureKey, FeatureSamples]] = {}
     for stage, extra in stages.items():
-        prefixes = {run.name: f"{run.name}/" if len(runs) > 1 else "" for run in runs}
-        rules_by_run = {run.name: _select_rules(run, prefixes[run.name], rules, failures) for run in runs}
         make = partial(_make_rule_analyser, config, rules_by_run, extra)
         folder = out / stage if stage == "fresh" else out / stage / str(config.recheck)
-        chosen = [(run, list(rules_by_run[run.name])) for run in runs]
-        results, errors = analyse_runs(chosen, make, folder, config, "testing rules of")
+        tested = [(run, list(rules_by_run[run.name])) for run in runs]
+        results, errors = analyse_runs(tested, make, folder, config, "testing rules of")
         samples_by_stage[stage] = {
             (name, index): samples
             for name, result in results.items()
@@ -132,10 +146,11 @@ def run_holes(config: HolesConfig) -> AnalysisReport:
     }
     no_samples = FeatureSamples((), (), ())
     explained = {
-        key: FailureWithRule(failure, rules[key], samples_by_stage["fresh"].get(key, no_samples))
+        key: FailureWithRule(failure, rules[key], samples_by_stage["fresh"].get(key, no_samples), cells.get(key))
         for key, failure in failures.items()
     }
-    report = build_holes_report(out, merge_holes(explained, samples_by_stage.get("rechecks")), facts, failed)
+    holes = merge_holes(explained, samples_by_stage.get("rechecks"))
+    report = build_holes_report(out, holes, failing, facts, failed)
     report.write()
     return report
 
@@ -159,6 +174,21 @@ class HolesAnalyser(_NeighbourhoodAnalyser[FrameHoles]):
 
     file, kind, schema = "holes.json", FrameHoles, 3
 
+    def __init__(
+        self, config: HolesConfig, chosen: Mapping[str, ChosenObjects], run: AttackRun, out: Path
+    ) -> None:
+        super().__init__(config, run, out)
+        self.chosen = chosen[run.name]
+
+    def load_result(self, name: str) -> FrameHoles:
+        """See `FrameAnalyser`. An earlier call may have sampled around more failures of the frame."""
+        result = super().load_result(name)
+        return replace(result, around=tuple(one for one in result.around if one.index in self.chosen[name]))
+
+    def is_done(self, name: str) -> bool:
+        """See `FrameAnalyser`. An earlier call may have sampled around fewer failures of the frame."""
+        return super().is_done(name) and {one.index for one in self.load_result(name).around} == self.chosen[name]
+
     def analyse(self, name: str, folder: Path) -> FrameHoles:
         """See `FrameAnalyser`."""
         start = time.perf_counter()
@@ -166,6 +196,7 @@ class HolesAnalyser(_NeighbourhoodAnalyser[FrameHoles]):
         around = tuple(
             _sample_failure(failure, neighbourhood, config.samples, config.seed)
             for failure, neighbourhood in frame.neighbourhoods(str(config.seed), config.reach)
+            if neighbourhood.index in self.chosen[name]
         )
         passes = sum(len(one.all_samples().margins) + one.lost.extra_samples for one in around)
         contrast, contrast_passes = _sample_all_objects(frame, config.contrast, config.seed)
@@ -214,36 +245,51 @@ def _make_rule_analyser(
     return RuleRegionAnalyser(config, run, rules, extra, out / digest)
 
 
-def _choose_frames(run: AttackRun, config: HolesConfig) -> list[str]:
-    """Return the frames with certain failures, or all frames if contrast is wanted and any frame has one."""
-    with_failures = [f.result.identifier for f in run.frames if certain_losses(f.result)]
-    return [f.result.identifier for f in run.frames] if with_failures and config.contrast else with_failures
+def _choose_failures(
+    frames: Mapping[str, tuple[AttackRun, RunFrame]], cells: Mapping[FailureKey, str], config: HolesConfig
+) -> dict[str, ChosenObjects]:
+    """Choose the failures to sample around, by run. Without --limit, all frames of a run with failures serve as
+    contrast, if any is wanted; else the frames of the chosen failures.
+    """
+    failures = [
+        (name, failure.index)
+        for name, (_, frame) in frames.items()
+        for failure in certain_losses(frame.result)
+        if failure.index is not None
+    ]
+    taken = take_in_turn(failures, cells)[: config.limit]
+    runs = {frames[name][0].name for name, _ in taken}
+    chosen: dict[str, ChosenObjects] = {run.name: {} for run, _ in frames.values()}
+    for name, (run, frame) in frames.items():
+        objects = {index for key, index in taken if key == name}
+        if objects or (config.limit is None and config.contrast and run.name in runs):
+            chosen[run.name][frame.result.identifier] = objects
+    return chosen
 
 
-def _select_rules(
-    run: AttackRun,
-    prefix: str,
-    rules: Mapping[FailureKey, FailureRule],
-    failures: Mapping[FailureKey, FailureSamples],
-) -> Rules:
-    """Select the rules of a run's failures that have samples. prefix: of its frames' names in `rules`."""
-    selected: Rules = {}
-    names = {prefix + frame.result.identifier: frame.result.identifier for frame in run.frames}
-    for key, failure in failures.items():
-        if key[0] in names and failure.samples.margins:
-            selected.setdefault(names[key[0]], {})[key[1]] = rules[key].where
-    return selected
+def take_in_turn(failures: Sequence[FailureKey], cells: Mapping[FailureKey, str]) -> list[FailureKey]:
+    """Order failures so that the first ones lie in as many cells as possible: one of each cell, then the second of
+    each, and so on; of cells with more failures first. Those without a cell count as one more cell.
+    """
+    sizes = Counter(cells.get(key) for key in failures)
+    seen: Counter[str | None] = Counter()
+    turns: dict[FailureKey, tuple[int, int]] = {}
+    for key in failures:
+        cell = cells.get(key)
+        turns[key] = seen[cell], -sizes[cell]
+        seen[cell] += 1
+    return sorted(failures, key=lambda key: turns[key])
 
 
-def _print_workload(runs: Sequence[AttackRun], config: HolesConfig) -> None:
+def _print_workload(runs: Sequence[AttackRun], chosen: Mapping[str, ChosenObjects], config: HolesConfig) -> None:
     """Print the number of passes, and the time at the pace of the runs, which is an upper limit: their seconds
     include more than passes.
     """
-    count = sum(len(certain_losses(frame.result)) for run in runs for frame in run.frames)
+    count = sum(len(objects) for frames in chosen.values() for objects in frames.values())
     results = [frame.result for run in runs for frame in run.frames if frame.result.passes]
     seconds, passes = sum(r.seconds for r in results), sum(r.passes or 0 for r in results)
     needed = count * (config.samples + config.fresh + (config.recheck or 0))
-    needed += config.contrast * sum(len(run.frames) for run in runs) if count else 0
+    needed += config.contrast * sum(map(len, chosen.values()))
     pace = ""
     if passes and count:
         pace = f", at most {max(needed * seconds / passes / 60, 0.1):.1f} min in one process"
@@ -365,17 +411,22 @@ _RECHECK_NOTE = (
 _MAX_PLOTTED = 12
 """Holes in the plot; the table has all."""
 _MAX_NAMED = 4
-"""Failures of a hole that the table names; holes.csv has all."""
+"""Failures and cells of a hole, and rules of a cell, that a table names; holes.json has all."""
+_CELLS_NOTE = (
+    "Cells are those of the run's map; a failure lies in the cell of its counterexample. {sampled} of {certain} "
+    "were sampled around, in turn from different cells. Rules for {ruled} of {failing}."
+)
 
 
 def build_holes_report(
-    out: Path, holes: Sequence[Hole], facts: Mapping[str, Any], failed: Mapping[str, str]
+    out: Path, holes: Sequence[Hole], failing: FailureMap, facts: Mapping[str, Any], failed: Mapping[str, str]
 ) -> AnalysisReport:
     """Build the report of all frames.
 
     Args:
         out: Output folder.
         holes: The holes.
+        failing: Map of the failing frames.
         facts: First entries of the JSON.
         failed: Reasons by frame without samples.
     """
@@ -389,34 +440,85 @@ def build_holes_report(
             else "-",
             "-" if hole.outside is None else f"{100 * hole.outside:.0f}",
             f"{100 * hole.lost.probability:.2g} [{100 * hole.lost.low:.2g}, {100 * hole.lost.high:.2g}]",
-            _name_failures(hole),
+            _shorten([failure.text for failure in hole.failures]),
+            _shorten(hole.cells) or "-",
             *((_format_recheck(hole.recheck),) if rechecks else ()),
         )
         for hole in holes
     )
-    columns = ("where", "class", "lost, %", "elsewhere, %", "size, %", "failures")
+    columns = ("where", "class", "lost, %", "elsewhere, %", "size, %", "failures", "cells")
     columns += ("again, %",) if rechecks else ()
     hold = sum(recheck.holds for recheck in rechecks)
     recheck_notes = (_RECHECK_NOTE.format(hold=hold, count=len(rechecks)),) if rechecks else ()
     title = f"Holes of {facts['detector']}, within {facts['params']}"
+    cells = _list_failing_cells(failing, holes)
+    cell_map = {"cells": cells, "frames_without_record": failing.frames_without_record}
     return AnalysisReport(
         out=out,
         name="holes",
         heading="Holes",
-        data={**facts, "rechecked": len(rechecks), "hold": hold, "holes": [hole.to_json() for hole in holes]},
+        data={
+            **facts,
+            "map": cell_map,
+            "rechecked": len(rechecks),
+            "hold": hold,
+            "holes": [hole.to_json() for hole in holes],
+        },
         csv_tables={"holes": [_csv_row(hole) for hole in holes]} if holes else {},
-        tables=[ReportTable(title, columns, lines)],
-        notes=(*_NOTES, *recheck_notes) if holes else (_NO_FAILURES,),
-        text_columns=("where", "class", "failures"),
+        tables=[ReportTable(title, columns, lines), *([_build_cell_table(cells, holes)] if cells else [])],
+        notes=(*_NOTES, _describe_cells(failing, cells, holes), *recheck_notes) if holes else (_NO_FAILURES,),
+        text_columns=("where", "class", "failures", "cells", "cell", "rule"),
         picture=partial(plot_holes, holes=holes) if holes else None,
         failed=failed,
     )
 
 
-def _name_failures(hole: Hole) -> str:
-    """Name the first failures of a hole, and count the others."""
-    texts = [failure.text for failure in hole.failures[:_MAX_NAMED]]
-    return "\n".join(texts + ([f"and {more} more"] if (more := len(hole.failures) - _MAX_NAMED) > 0 else []))
+def _list_failing_cells(failing: FailureMap, holes: Sequence[Hole]) -> list[dict[str, Any]]:
+    """For each failing cell, count its failures and those sampled around, and list the holes of these with a rule."""
+    cells = []
+    for cell in failing.cells:
+        counts = [sum(failure.cell == cell.name for failure in hole.failures) for hole in holes]
+        ruled = [number for number, count in enumerate(counts) if count and holes[number].where]
+        if cell.certain:
+            cells.append({"cell": cell.name, "certain": cell.certain, "sampled": sum(counts), "holes": ruled})
+    return cells
+
+
+def _build_cell_table(cells: Sequence[Mapping[str, Any]], holes: Sequence[Hole]) -> ReportTable:
+    rules = (_shorten([holes[number].rule_text for number in cell["holes"]]) for cell in cells)
+    lines = tuple(
+        (
+            cell["cell"],
+            str(cell["certain"]),
+            str(cell["sampled"]),
+            rule or ("no rule found" if cell["sampled"] else "not sampled"),
+        )
+        for cell, rule in zip(cells, rules, strict=True)
+    )
+    return ReportTable("Failing cells of the map", ("cell", "certain", "sampled", "rule"), lines)
+
+
+def _describe_cells(failing: FailureMap, cells: Sequence[Mapping[str, Any]], holes: Sequence[Hole]) -> str:
+    certain = sum(cell["certain"] for cell in cells)
+    ruled = sum(bool(cell["holes"]) for cell in cells)
+    text = _CELLS_NOTE.format(
+        sampled=sum(cell["sampled"] for cell in cells),
+        certain=format_count(certain, "certain failure"),
+        ruled=ruled,
+        failing=format_count(len(cells), "failing cell"),
+    )
+    left_out = failing.frames_without_record
+    return (
+        f"{text} {format_count(left_out, 'frame')} without a record of the search: in no cell."
+        if left_out
+        else text
+    )
+
+
+def _shorten(texts: Sequence[str]) -> str:
+    """Join the first texts as lines, and count the others."""
+    more = len(texts) - _MAX_NAMED
+    return "\n".join([*texts[:_MAX_NAMED], *([f"and {more} more"] if more > 0 else [])])
 
 
 def _format_rate(rate: float, low: float | None, high: float | None) -> str:
@@ -448,6 +550,7 @@ def _csv_row(hole: Hole) -> dict[str, Any]:
         "size_low": hole.lost.low,
         "size_high": hole.lost.high,
         "failures": "; ".join(failure.text for failure in hole.failures),
+        "cells": "; ".join(hole.cells),
     }
 
 

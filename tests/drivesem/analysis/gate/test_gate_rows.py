@@ -10,6 +10,7 @@ import pytest
 
 from drivesem.analysis.gate import (
     ALL,
+    CELL,
     HOLE,
     KIND,
     PHANTOMS,
@@ -40,8 +41,8 @@ def pair(
     return PairedSamples(index, "Car", error, old, new, old_phantoms, new_phantoms)
 
 
-def rows(found, tolerance: float = 0.05):
-    return compute_gate_rows(found, tolerance, DRAWS, 0)
+def rows(found, tolerance: float = 0.05, cells: dict[tuple[str, int], str] | None = None):
+    return compute_gate_rows(found, tolerance, DRAWS, 0, cells or {})
 
 
 def test_shares_and_order() -> None:
@@ -105,6 +106,43 @@ def test_p_is_of_samples_in_which_one_fails_alone() -> None:
     compared = {row.hole: row.p for row in rows({"a": [pair(4, 14)], "b": [pair(9, 9)]})}
     assert compared["a: objects[0]"] == compared["missed"] == compared[ALL] == pytest.approx(4 * 2**-10)
     assert compared["b: objects[0]"] == 1
+
+
+def test_a_cell_has_the_samples_around_its_failures() -> None:
+    """Of four failures one lies in no cell, as its frame has no record of the search."""
+    found = {"a": [pair(4, 14), pair(10, 10, index=1)], "b": [pair(16, 2)], "c": [pair(5, 5, index=7)]}
+    cells = {("a", 0): "near", ("b", 0): "far", ("a", 1): "near"}
+    compared = {row.hole: row for row in rows(found, cells=cells) if row.level == CELL}
+    assert list(compared) == ["near", "far"]
+    near, far = compared["near"], compared["far"]
+    assert (near.before, near.after, near.samples, near.holes) == pytest.approx((14 / 40, 24 / 40, 40, 2))
+    assert (far.before, far.after, far.samples, far.holes) == pytest.approx((0.8, 0.1, 20, 1))
+    assert (near.change, far.change) == ("same", "fell")  # one hole alone grew: the interval over both contains 0
+    assert [row.level for row in rows(found, cells=cells)][3:6] == [HOLE, CELL, CELL]
+
+
+def test_cells_of_several_holes_are_further_tests() -> None:
+    """Three holes, all of them and phantoms: five tests. A cell of two holes is a sixth, one of one hole is none."""
+    found = {"a": [pair(4, 14)], "b": [pair(9, 9)], "c": [pair(9, 9)]}
+    for cells, tests in (
+        ({}, 5),
+        ({("c", 0): "far"}, 5),
+        ({("a", 0): "near", ("b", 0): "near"}, 6),
+        ({("a", 0): "near", ("b", 0): "near", ("c", 0): "far"}, 6),
+        ({("a", 0): "near", ("b", 0): "near", ("c", 0): "near"}, 5),
+    ):
+        compared = {row.hole: row.p for row in rows(found, cells=cells)}
+        assert compared["a: objects[0]"] == pytest.approx(tests * 2**-10)
+
+
+def test_what_fell_is_beyond_chance_too() -> None:
+    assert [row.change for row in rows({"a": [pair(14, 4)]})] == ["fell", "fell", "fell", "same"]
+    assert {row.change for row in rows({"a": [pair(14, 4)]}, tolerance=0.6)} == {"same"}
+    # Six of six samples: p is 2**-6 of one test, and above 0.05 of the five of three holes.
+    assert rows({"a": [pair(9, 3)]})[0].change == "fell"
+    three = rows({"a": [pair(9, 3)], "b": [pair(9, 9)], "c": [pair(9, 9)]})
+    assert {row.change for row in three} == {"same"}
+    assert not any(row.fell for row in rows({"a": [pair(4, 14)]}))
 
 
 def test_one_sample_is_no_evidence() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +19,13 @@ from drivesem.analysis.holes.rules import (
     kitti_shares,
     merge_holes,
 )
+from drivesem.analysis.holes.run import build_holes_report, take_in_turn
 from drivesem.attacks.space import SPECS, Parameter
 from drivesem.failures.failure_probability import FailureProbability
+from drivesem.failures.feature_cells import Cell, CellVisit
 from drivesem.failures.neighbourhood import IMAGE_FEATURES, POSE_FEATURES
 from drivesem.failures.rules import fit_rule
+from drivesem.run.feature_map import FailureMap
 
 NAMES = ("height_px", "lightness")
 NOTHING = FeatureSamples((), (), ())
@@ -217,3 +221,43 @@ def test_sizes_by_samples_and_by_simulation() -> None:
     size = hole.to_json()["size"]
     assert [size["probability"], *size["interval"]] == pytest.approx([0.105, 0.051, 0.225])
     assert (size["by"], hole.lost.extra_samples) == ("samples and subset simulation", 90)
+
+
+def test_failures_are_taken_in_turn_from_cells() -> None:
+    """Five hundred of one fog are one finding: two failures cover two cells, whichever frames they are of."""
+    foggy = [(f"{number:03}", 0) for number in range(500)]
+    cells = dict.fromkeys(foggy, "fog") | {("900", 1): "near", ("901", 0): "near", ("902", 3): "far"}
+    failures = [*foggy, ("900", 1), ("901", 0), ("902", 3), ("old", 2)]
+    order = take_in_turn(failures, cells)
+    assert order[:6] == [("000", 0), ("900", 1), ("902", 3), ("old", 2), ("001", 0), ("901", 0)]
+    assert sorted(order) == sorted(failures)
+    assert order[6:] == foggy[2:]
+
+
+def test_the_report_names_cells_with_a_rule_and_those_without(tmp_path: Path) -> None:
+    """A rule for one failure, none for a second, and a third and fourth that were not sampled."""
+    places: list[Cell] = [(0, 0, 0, 1), (0, 0, 1, 1), (0, 0, 2, 1), (0, 0, 2, 1)]
+    visits = [(str(i), [CellVisit(0, cell, 1, 1, final=True)], {0}) for i, cell in enumerate(places)]
+    failing = FailureMap.from_frames([*visits, ("old", [], {0})])
+    names = list(dict.fromkeys(failing.cells_by_failure().values()))
+    even = replace(around(20, 40), rule=FailureRule({}, False), fresh=NOTHING, cell=names[1])
+    holes = merge({"0": [replace(around(20, 40), cell=names[0])], "1": [even]})
+    report = build_holes_report(tmp_path, holes, failing, {"detector": "any", "params": "color"}, {})
+    numbers = [number for number, hole in enumerate(holes) if hole.where]
+    assert report.data["map"] == {
+        "cells": [
+            {"cell": names[0], "certain": 1, "sampled": 1, "holes": numbers},
+            {"cell": names[1], "certain": 1, "sampled": 1, "holes": []},
+            {"cell": names[2], "certain": 2, "sampled": 0, "holes": []},
+        ],
+        "frames_without_record": 1,
+    }
+    hole = report.data["holes"][numbers[0]]
+    assert (hole["cells"], hole["failures"][0]["cell"]) == ([names[0]], names[0])
+    page = report.to_markdown()
+    assert f"| {names[0]} | 1 | 1 | height in the picture 20 to 40 px |" in page
+    assert f"| {names[1]} | 1 | 1 | no rule found |" in page
+    assert f"| {names[2]} | 2 | 0 | not sampled |" in page
+    assert "2 of 4 certain failures were sampled around" in page
+    assert "Rules for 1 of 3 failing cells." in page
+    assert "1 frame without a record of the search: in no cell." in page
