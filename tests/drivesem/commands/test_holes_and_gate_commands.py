@@ -47,6 +47,7 @@ ATTACK = [
 ]
 STILL = ["--nuisances", "off", "--no-confirm", "--second-detector", "off", "--workers", "1", "--json"]
 HOLES = ["--workers", "1", "--json", "--samples", "64", "--fresh", "10"]
+SHORT_HOLES = ["--workers", "1", "--json", "--samples", "24", "--fresh", "1", "--contrast", "0"]
 WIDE = 0.06
 """Of the band of lightness in which cars are not seen, below the lightness of either car as photographed."""
 
@@ -173,6 +174,56 @@ def test_a_second_call_resumes_with_equal_results(attacked: Path, mapped: Path) 
     run_json("holes", attacked, *HOLES, "--out", mapped)
     assert (mapped / "holes.json").read_text() == before
     assert cached.stat().st_mtime_ns == written
+
+
+def test_a_limit_counts_failures_and_a_later_call_takes_more(attacked: Path, tmp_path: Path) -> None:
+    """The frame has two failures in two cells; what is sampled with a limit equals what is sampled without."""
+    run = shutil.copytree(attacked, tmp_path / "run")
+    path = run / "frames" / "demo-000" / "result.json"
+    result = json.loads(path.read_text())
+    (failure,) = (one for one in result["failures"] if one["grade"] == "certain")
+    result["failures"].append(failure | {"index": 1 - failure["index"]})
+    path.write_text(json.dumps(result))
+    words = [str(run), *SHORT_HOLES, "--out", str(tmp_path / "holes")]
+    (limited, record), (whole, all_records) = (
+        (run_json("holes", *words, *limit), _load_holes(tmp_path / "holes")) for limit in (("--limit", "1"), ())
+    )
+    for data, sampled in ((limited, 1), (whole, 2)):
+        failing = {row["cell"]: row["certain"] for row in data["map"]["cells"]}
+        assert list(failing.values()) == [1, 1]
+        assert (data["failures"], sum(row["sampled"] for row in data["map"]["cells"])) == (sampled, sampled)
+        named = {failure["cell"] for hole in data["holes"] for failure in hole["failures"]}
+        assert len(named) == sampled
+        assert named <= failing.keys()
+    assert [one for one in all_records.around if one.index == record.around[0].index] == list(record.around)
+    assert run_json("holes", *words, "--limit", "1")["holes"] == limited["holes"]
+    assert _load_holes(tmp_path / "holes").around == all_records.around
+
+
+def _load_holes(out: Path) -> FrameHoles:
+    return load_record(out / "runs" / "0" / "frames" / "demo-000" / "holes.json", FrameHoles, 3)
+
+
+@pytest.mark.usefixtures("gate")
+def test_a_run_of_an_older_version_has_no_cells(attacked: Path, tmp_path: Path) -> None:
+    """Its frames have no record of the search: holes and gate do the same without cells, and count them."""
+    run = shutil.copytree(attacked, tmp_path / "run")
+    path = run / "frames" / "demo-000" / "result.json"
+    result = json.loads(path.read_text())
+    path.write_text(json.dumps({key: value for key, value in result.items() if key != "visits"}))
+    data = run_json("holes", run, *SHORT_HOLES, "--out", tmp_path / "holes")
+    assert data["map"] == {"cells": [], "frames_without_record": 1}
+    assert data["failures"] == 1
+    assert {failure["cell"] for hole in data["holes"] for failure in hole["failures"]} == {None}
+    assert "1 frame without a record of the search: in no cell" in (tmp_path / "holes" / "holes.md").read_text()
+    words = ["--before", "any", "--after", "any", "--samples", "4", "--workers", "1"]
+    for folder, levels in ((attacked, {"hole", "cell", "kind", "all", "phantoms"}),
+                           (run, {"hole", "kind", "all", "phantoms"})):  # fmt: skip
+        data = run_json("gate", folder, *words, "--out", tmp_path / f"gate-{folder.name}")
+        assert {row["level"] for row in data["rows"]} == levels
+        assert data["frames_without_record"] == int(folder is run)
+    page = (tmp_path / "gate-run" / "gate.md").read_text()
+    assert "1 frame without a record of the search: in no cell" in page
 
 
 @pytest.mark.slow
