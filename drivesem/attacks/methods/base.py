@@ -105,8 +105,10 @@ class MarginOracle(Protocol):
         """Detector passes so far."""
         ...
 
-    def margins(self, theta: Tensor, number: int) -> Tensor:
-        """Margins (N,) at theta (D,) in a sample; inf for objects that do not count there. Costs a pass."""
+    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int]) -> Tensor:
+        """Margins (C, N) at thetas (D,), each in the sample of its number; inf for objects that do not count there.
+        Costs C passes.
+        """
         ...
 
     def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
