@@ -198,7 +198,9 @@ class NuisanceMarginOracle:
         """Detections in images (C, 3, H, W), as candidates of a detector without any."""
         classes = self.objective.classes
         found = predict(self.objective.detector, images)
-        return [losses.candidates_from_detections(classes.map_detections(one), len(classes.names)) for one in found]
+        return [
+            losses.candidates_from_detections(classes.map_detections(one), len(classes.names)) for one in found
+        ]
 
     def _find_candidates(self, image: Tensor, number: int, render: Render) -> Candidates:
         if not self.differentiable:
