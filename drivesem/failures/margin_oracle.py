@@ -4,7 +4,7 @@ lowers. Certificates use samples of another stream, which no search sees.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -80,16 +80,20 @@ class NuisanceMarginOracle:
         return self.objective.passes
 
     @torch.no_grad()
-    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int]) -> Tensor:
+    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int], random: Collection[int] = ()) -> Tensor:
         """Margins (C, N) at C thetas (D,), each in the sample of its number; infinite for objects that do not count.
-        Costs C passes. On a GPU the states are rendered and detected together; on a CPU a picture then costs as much
-        as alone.
+        `random` has the places of thetas that no score influenced. Costs C passes. On a GPU the states are rendered
+        and detected together; on a CPU a picture then costs as much as alone.
         """
         self.objective.passes += len(thetas)
-        states = list(zip(thetas, numbers, strict=True))
+        states = [
+            (theta, number, i in random) for i, (theta, number) in enumerate(zip(thetas, numbers, strict=True))
+        ]
         if len(states) > 1 and self.objective.space.scene.photograph.is_cuda:
             return torch.stack(run_in_halves(self._margins_together, states, "samples"))
-        return torch.stack([self._compute_margins(theta, number, None) for theta, number in states])
+        return torch.stack(
+            [self._compute_margins(theta, number, None, chance) for theta, number, chance in states]
+        )
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Compute soft margins in one sample, and the gradient of their weighted sum. Costs three passes.
@@ -150,10 +154,10 @@ class NuisanceMarginOracle:
             self._samples[number] = self.nuisances.sample(self.stream, number, self.objective.space.scene)
         return self._samples[number]
 
-    def _margins_together(self, states: Sequence[tuple[Tensor, int]]) -> list[Tensor]:
-        scenes = [self._perturb_scene(*state) for state in states]
+    def _margins_together(self, states: Sequence[tuple[Tensor, int, bool]]) -> list[Tensor]:
+        scenes = [self._perturb_scene(theta, number) for theta, number, _ in states]
         renders = render_batch([(self.objective.compositor, scene) for scene in scenes])
-        samples = [self.sample(number) for _, number in states]
+        samples = [self.sample(number) for _, number, _ in states]
         images = [sample.degrade_image(render.image) for sample, render in zip(samples, renders, strict=True)]
         if self.differentiable:
             detector = self.objective.differentiable
@@ -161,17 +165,17 @@ class NuisanceMarginOracle:
             candidates = [detector.candidates(raw.select(i)) for i in range(len(images))]
         else:
             candidates = self._detect(torch.stack(images))
-        return [
-            self._margins_in_sample(*state, None)
-            for state in zip(candidates, images, samples, scenes, renders, strict=True)
-        ]
+        parts = zip(candidates, images, samples, scenes, renders, states, strict=True)
+        return [self._margins_in_sample(*part, None, random) for *part, (_, _, random) in parts]
 
-    def _compute_margins(self, theta: Tensor, number: int, sharpness: float | None) -> Tensor:
+    def _compute_margins(
+        self, theta: Tensor, number: int, sharpness: float | None, random: bool = False
+    ) -> Tensor:
         scene, sample = self._perturb_scene(theta, number), self.sample(number)
         render = self.objective.compositor.render(scene)
         image = sample.degrade_image(render.image)
         candidates = self._find_candidates(image, number, render)
-        return self._margins_in_sample(candidates, image, sample, scene, render, sharpness)
+        return self._margins_in_sample(candidates, image, sample, scene, render, sharpness, random)
 
     def _perturb_scene(self, theta: Tensor, number: int) -> SceneIR:
         space = self.objective.space
@@ -185,12 +189,13 @@ class NuisanceMarginOracle:
         scene: SceneIR,
         render: Render,
         sharpness: float | None,
+        random: bool,
     ) -> Tensor:
         """Margins (N,) from the candidates in a sample's image, which enter the search log."""
         rows, boxes_xyxy, margins = self._object_margins(candidates, sample, scene, render, sharpness)
         passes = 1 if sharpness is None else GRADIENT_PASSES
         values = margins.detach()
-        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, values < 0, passes, values)
+        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, values < 0, passes, values, random)
         everywhere = margins.new_full((len(self.counted_objects),), torch.inf)
         return everywhere.index_put((rows.to(margins.device),), margins)
 

@@ -688,7 +688,7 @@ def summarise_run(
         frames_without_vehicles=0,
         frames_failed={},
         seconds=0.0,
-        rate=estimate_rate(results) if config.samples_states else None,
+        rate=None if config.changes else estimate_rate(results),
         **summarise_frames(results, classes, t_star, headline),
     )
 

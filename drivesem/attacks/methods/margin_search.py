@@ -6,7 +6,7 @@ Objects are nearly independent, so the worst points of all objects are combined 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -140,19 +140,22 @@ class MarginSearchState:
         self._sample += 1
         return self._sample % _SEARCH_SAMPLES
 
-    def margins(self, points: Sequence[Tensor], numbers: Sequence[int]) -> Tensor:
-        """Margins (C, N) of the objects at points u (K,), each in the nuisance sample of its number."""
-        return self.oracle.margins([self.theta(point)[0] for point in points], numbers)
+    def margins(self, points: Sequence[Tensor], numbers: Sequence[int], random: Collection[int] = ()) -> Tensor:
+        """Margins (C, N) of the objects at points u (K,), each in the nuisance sample of its number; see
+        `MarginOracle`.
+        """
+        return self.oracle.margins([self.theta(point)[0] for point in points], numbers, random)
 
     def objective(self, margins: Tensor) -> float:
         """See `margin_objective`."""
         return margin_objective(margins, self.oracle.counted_objects)
 
-    def candidates(self, points: Tensor) -> list[Tensor]:
+    def candidates(self, points: Tensor, random: Collection[int] = ()) -> list[Tensor]:
         """The best of the points (C, K), and combinations of the best point of each object with the scene
         coordinates of the best and second-best point. Each point gets another nuisance sample; costs C passes.
+        `random` has the places of points that no score influenced.
         """
-        margins = self.margins(list(points), [self.next_sample() for _ in points])
+        margins = self.margins(list(points), [self.next_sample() for _ in points], random)
         values = [self.objective(row) for row in margins]
         order = sorted(range(len(points)), key=values.__getitem__)
         return [points[order[0]], *(self.combine_objects(points, margins, row) for row in order[:2])]
@@ -270,29 +273,32 @@ class Climb(MarginSearch):
     """Whether to use gradients where the detector has one."""
 
     def _search(self, search: MarginSearchState) -> Tensor:
-        start = _choose_start(search, self._start_points(search, max(int(_START_SHARE * self.passes), 1)))
+        points = self._start_points(search, max(int(_START_SHARE * self.passes), 1))
+        start = _choose_start(search, *points)
         return _Descent(search, self.gradient and search.oracle.differentiable).descend(start)
 
-    def _start_points(self, search: MarginSearchState, count: int) -> Tensor:
-        """Points (count, K) of which the start is made."""
-        return sample_points(search, count)
+    def _start_points(self, search: MarginSearchState, count: int) -> tuple[Tensor, range]:
+        """Points (count, K) of which the start is made, and the places of those that are uniform in the box."""
+        return sample_points(search, count), range(1, count, 2)
 
 
-def _choose_start(search: MarginSearchState, points: Tensor) -> Tensor:
+def _choose_start(search: MarginSearchState, points: Tensor, random: Collection[int]) -> Tensor:
     """The start u (K,): the best of the candidates that the points (C, K) give."""
-    starts = search.candidates(points)
+    starts = search.candidates(points, random)
     number = search.next_sample()
     values = [search.objective(row) for row in search.margins(starts, [number] * len(starts))]
     return starts[min(range(len(starts)), key=values.__getitem__)]
 
 
 def sample_points(search: MarginSearchState, count: int) -> Tensor:
-    """Points (count, K): balanced corners and a scrambled Halton sequence alternately."""
+    """Points (count, K): balanced corners and a scrambled Halton sequence alternately, which is uniform in the box."""
     from scipy.stats import qmc  # imported on use: it takes a third of a second to load
 
     box = search.box
     rng = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
-    points = torch.from_numpy(qmc.Halton(len(box.owner), scramble=True, rng=rng).random(count))
+    points = torch.empty(count, len(box.owner), dtype=torch.float64)
+    # A sequence of its own: every second point of a longer one would stay in one half of the first coordinate.
+    points[1::2] = torch.from_numpy(qmc.Halton(len(box.owner), scramble=True, rng=rng).random(count // 2))
     points[::2] = balanced_corners(box.owner, (count + 1) // 2, search.generator)
     return points.to(box.start)
 
