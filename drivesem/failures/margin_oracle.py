@@ -165,8 +165,10 @@ class NuisanceMarginOracle:
             candidates = [detector.candidates(raw.select(i)) for i in range(len(images))]
         else:
             candidates = self._detect(torch.stack(images))
-        parts = zip(candidates, images, samples, scenes, renders, states, strict=True)
-        return [self._margins_in_sample(*part, None, random) for *part, (_, _, random) in parts]
+        return [
+            self._margins_in_sample(candidates[i], images[i], samples[i], scenes[i], renders[i], None, random)
+            for i, (_, _, random) in enumerate(states)
+        ]
 
     def _compute_margins(
         self, theta: Tensor, number: int, sharpness: float | None, random: bool = False

@@ -145,7 +145,8 @@ class SearchLog:
             row = np.array([state.passes, miss, state.random, state.random and miss])
             counts[index, cell] = counts.get((index, cell), 0) + row
         ends = set(enumerate(counterexample))
-        return tuple(
-            CellVisit(*pair, *row[:2].tolist(), pair in ends, *row[2:].tolist())
-            for pair, row in sorted(counts.items())
-        )
+        visits: list[CellVisit] = []
+        for pair, row in sorted(counts.items()):
+            passes, misses, random, random_misses = row.tolist()
+            visits.append(CellVisit(*pair, passes, misses, pair in ends, random, random_misses))
+        return tuple(visits)
