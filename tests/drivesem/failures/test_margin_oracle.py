@@ -65,6 +65,23 @@ def test_a_number_is_one_draw(views: NuisanceMarginOracle, objective: Objective)
     assert torch.equal(anew.margins([objective.space.theta0], [3])[0], one)
 
 
+def random_states(objective: Objective) -> int:
+    return max((visit.random for visit in objective.cell_visits(objective.benign)), default=0)
+
+
+@pytest.mark.parametrize(("method", "expected"), [("random", 2), ("climb", 0)])
+def test_states_that_no_score_influences_are_recorded_as_random(method: str, expected: int) -> None:
+    scene = demo_scene(0, 0)
+    space = ParameterSpace(scene, ("color",))
+    objective = Objective(Compositor(scene), space, load_detector("squeezedet"), AttackConfig(method=method))
+    for share in (0.0, 0.1, 0.2):  # the first is the photograph
+        objective.score(share * space.upper)
+    assert random_states(objective) == expected
+    oracle = NuisanceMarginOracle.for_objective(objective, Nuisances.parse("off"), "any")
+    oracle.margins([0.1 * space.upper, 0.2 * space.upper, 0.3 * space.upper], [0, 1, 2], random=range(1, 2))
+    assert random_states(objective) == expected + 1
+
+
 def test_gradients_against_differences(objective: Objective) -> None:
     """Along a direction of paint and weather, without the steps that JPEG makes."""
     views = NuisanceMarginOracle.for_objective(objective, Nuisances.parse("noise=0,jpeg=0"), "search")
