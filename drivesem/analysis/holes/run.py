@@ -60,7 +60,7 @@ _RECHECK_TRIES = 20
 Rules = dict[str, dict[int, Intervals]]
 """Rules of a run's failures, by frame and object."""
 ChosenObjects = dict[str, set[int]]
-"""Objects of a run whose failures are sampled, by frame; none in frames that only serve as contrast."""
+"""Objects of a run to sample around, by frame; none in frames that only serve as contrast."""
 
 
 @dataclass(frozen=True, slots=True)
