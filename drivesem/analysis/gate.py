@@ -64,7 +64,8 @@ _NOTE = (
     "interval, over samples for a hole, and over holes for cells, kinds, all, and phantoms. A cell has the samples "
     "around the failures that lie in it on the run's map. p: exact sign test of the "
     "samples in which only one detector fails, with Holm's correction over all rows. A row grew if the difference "
-    "exceeds the tolerance, its interval lies above 0, and p is below 0.05; it fell if the same holds the other way."
+    "exceeds the tolerance, its interval lies above 0, and p is below 0.05; it fell if the same holds the other way, "
+    "and is the same if its interval is within the tolerance."
 )
 _NO_SAMPLES = "no sample counts around any certain failure"
 _SIDES = ("unchanged", "changed")
@@ -137,21 +138,21 @@ class GateRow:
     """Number of samples."""
     holes: int
     """Number of holes."""
-    grew: bool
-    """Whether the rate grew by more than the tolerance and more than chance explains."""
-    fell: bool
-    """Whether it fell by more than the tolerance and more than chance explains."""
+    change: Literal["grew", "fell", "same", "unclear"]
+    """grew, fell: the rate changed by more than the tolerance and more than chance explains; same: the interval of
+    the difference is within the tolerance; unclear: none of these.
+    """
 
     @property
-    def change(self) -> str:
-        """grew, fell or same."""
-        return "grew" if self.grew else "fell" if self.fell else "same"
+    def grew(self) -> bool:
+        """Whether the rate grew, which fails the gate."""
+        return self.change == "grew"
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object."""
         data = asdict(self)
         data["interval"] = [data.pop("low"), data.pop("high")]
-        return data
+        return {**data, "grew": self.grew}
 
 
 def run_gate(config: GateConfig) -> AnalysisReport:
@@ -482,6 +483,14 @@ def _compute_row(
     assert rates.second is not None
     assert rates.difference is not None
     worse, better = (p < 1 - LEVEL for p in p_values)
+    low, high = (-1.0, 1.0) if rates.low is None or rates.high is None else (rates.low, rates.high)
+    change: Literal["grew", "fell", "same", "unclear"] = "unclear"
+    if worse and rates.difference > tolerance and low > 0:
+        change = "grew"
+    elif better and -rates.difference > tolerance and high < 0:
+        change = "fell"
+    elif -tolerance <= low and high <= tolerance:
+        change = "same"
     return GateRow(
         level=key[0],
         hole=key[1],
@@ -493,8 +502,7 @@ def _compute_row(
         p=p_values[0],
         samples=sum(len(pair.before) for pair in pairs),
         holes=len(pairs),
-        grew=worse and rates.difference > tolerance and (rates.low is None or rates.low > 0),
-        fell=better and -rates.difference > tolerance and (rates.high is None or rates.high < 0),
+        change=change,
     )
 
 

@@ -22,7 +22,7 @@ _NOTE = (
     "same pictures. In brackets: 95 % by paired bootstrap, over poses of one failure, and over failures for "
     "classes and for all. p: exact sign test of the poses in which only one network is wrong, with Holm's correction "
     "over all rows. A row grew if the difference is above the tolerance, its interval above 0, and p below 0.05; it "
-    "fell if the same holds the other way."
+    "fell if the same holds the other way, and is the same if its interval is within the tolerance."
 )
 
 
