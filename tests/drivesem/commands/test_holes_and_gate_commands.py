@@ -216,6 +216,11 @@ def test_a_run_of_an_older_version_has_no_cells(attacked: Path, tmp_path: Path) 
     assert data["failures"] == 1
     assert {failure["cell"] for hole in data["holes"] for failure in hole["failures"]} == {None}
     assert "1 frame without a record of the search: in no cell" in (tmp_path / "holes" / "holes.md").read_text()
+    both = run_json("holes", run, attacked, *SHORT_HOLES, "--limit", "2", "--out", tmp_path / "both")
+    (cell,) = both["map"]["cells"]
+    assert (cell["sampled"], both["map"]["frames_without_record"]) == (1, 1)
+    named = {failure["frame"]: failure["cell"] for hole in both["holes"] for failure in hole["failures"]}
+    assert named == {"run/demo-000": None, "dark/demo-000": cell["cell"]}
     words = ["--before", "any", "--after", "any", "--samples", "4", "--workers", "1"]
     for folder, levels in ((attacked, {"hole", "cell", "kind", "all", "phantoms"}),
                            (run, {"hole", "kind", "all", "phantoms"})):  # fmt: skip
