@@ -211,7 +211,9 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         provenance[f"objects[{index}].mask_iou"] = f"{cut.agreement:.3f}"
     provenance |= {f"labels[{row}].background": reason for row, reason in left_out.items()}
     # People, trams and vehicles that were not cut out stay in the background, and no detection counts there.
+    _, ridden = people.join_riders(labels)
     object_rows = {cut.row for cut in cuts}
+    object_rows |= {ridden[row] for row in object_rows & ridden.keys()}
     other_labels = labels.select([row for row in range(len(labels.kind)) if row not in object_rows])
     if ego_mask is not None:
         regions = torch.cat([other_labels.ignore_xyxy, ego.ignored_regions(ego_mask).to(other_labels.ignore_xyxy)])
