@@ -705,7 +705,7 @@ def _separate_layers(
     filled = fill.fill_hole(hole, settings.seed)
     mattes = [cutout_opacity(cut.cutout, cut.mask, cut.hidden) for cut in cuts]
     for i, reach in reaches:
-        filled = fill.fill_thin(filled, grow_mask(reach, 2), hole, settings.seed)
+        filled = fill.fill_thin(filled, grow_mask(reach, 2))
         mattes[i] = np.maximum(mattes[i], _TRACE_OPACITY * reach).astype(np.float32)
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)
