@@ -286,10 +286,8 @@ def _format_misses(tracks: Sequence[TrackResult], noun: str) -> str:
         sum(getattr(one, f"lost_{state}") for one in tracks) for state in ("before", "after", "control")
     )
     sightings = format_count(sum(one.frames for one in tracks), "sighting")
-    return (
-        f"{after} of {sightings} of {format_count(len(tracks), noun)} missed ({before} before, {control} by a random "
-        "change)"
-    )
+    counted = format_count(sum(one.frames > 0 for one in tracks), noun)
+    return f"{after} of {sightings} of {counted} missed ({before} before, {control} by a random change)"
 
 
 def list_infeasible(result: DriveResult) -> list[str]:
