@@ -132,6 +132,7 @@ class Objective:
         self.search_log.record(
             self.benign.render.image, rows, self.benign.paper.boxes_xyxy[rows], missed, self.passes
         )
+        self._scores_random_states = config.samples_states
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
         self._scores: dict[bytes, Score] = {}
         self.previews: dict[bytes, Score] = {}
@@ -282,7 +283,8 @@ class Objective:
         rows = torch.tensor(self.found_before, dtype=torch.int64)
         rows = rows[~moved.ignore[rows]]
         missed = torch.isin(rows, torch.tensor(failed.lost, dtype=torch.int64))
-        self.search_log.record(image.detach(), rows, moved.boxes_xyxy[rows], missed, passes)
+        boxes_xyxy, random = moved.boxes_xyxy[rows], self._scores_random_states and passes > 0
+        self.search_log.record(image.detach(), rows, boxes_xyxy, missed, passes, random=random)
         # The projection treats vehicles as boxes, which may hide others from the start; a render is exact.
         hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
         return Score(

@@ -41,3 +41,7 @@ class CellVisit:
     """Evaluated states in which it is missed there."""
     final: bool = False
     """Whether it lies there in the counterexample."""
+    random: int = 0
+    """Evaluated states that no score influenced."""
+    random_misses: int = 0
+    """Of these, states in which it is missed."""

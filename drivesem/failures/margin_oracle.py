@@ -4,12 +4,13 @@ lowers. Certificates use samples of another stream, which no search sees.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from detectors.base import Candidates, Detector, predict
+from detectors.base import Candidates, Detector, predict, run_in_halves
 from detectors.incremental.reference import ReferencePass
 from detectors.types import Targets
 from drivesem.attacks import losses
@@ -21,6 +22,7 @@ from drivesem.failures.certificate import pad_visible_boxes
 from drivesem.failures.kinds import LabelledDetections, match_detections
 from drivesem.failures.nuisances import Nuisances, NuisanceSample
 from drivesem.failures.search_log import ObjectPatches
+from scene_ir.render.compositor import render_batch
 from scene_ir.types import Render, SceneIR
 
 SHARPNESS = 4.0
@@ -78,10 +80,20 @@ class NuisanceMarginOracle:
         return self.objective.passes
 
     @torch.no_grad()
-    def margins(self, theta: Tensor, number: int) -> Tensor:
-        """Margins (N,) at theta (D,) in one sample; infinite for objects that do not count. Costs a pass."""
-        self.objective.passes += 1
-        return self._compute_margins(theta, number, None)
+    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int], random: Collection[int] = ()) -> Tensor:
+        """Margins (C, N) at C thetas (D,), each in the sample of its number; infinite for objects that do not count.
+        `random` has the places of thetas that no score influenced. Costs C passes. On a GPU the states are rendered
+        and detected together; on a CPU a picture then costs as much as alone.
+        """
+        self.objective.passes += len(thetas)
+        states = [
+            (theta, number, i in random) for i, (theta, number) in enumerate(zip(thetas, numbers, strict=True))
+        ]
+        if len(states) > 1 and self.objective.space.scene.photograph.is_cuda:
+            return torch.stack(run_in_halves(self._margins_together, states, "samples"))
+        return torch.stack(
+            [self._compute_margins(theta, number, None, chance) for theta, number, chance in states]
+        )
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Compute soft margins in one sample, and the gradient of their weighted sum. Costs three passes.
@@ -120,8 +132,7 @@ class NuisanceMarginOracle:
         Returns:
             Rows (K,) of the objects that count, and their features (K, F), `search_log.OBJECT_FEATURES`.
         """
-        space, sample = self.objective.space, self.sample(number)
-        scene = sample.perturb_scene(space.apply(space.scene, theta))
+        scene, sample = self._perturb_scene(theta, number), self.sample(number)
         render = self.objective.compositor.render(scene)
         targets, rows = self._counted_targets(scene, render)
         boxes_xyxy = sample.transform_boxes(targets.boxes_xyxy[rows])
@@ -143,24 +154,64 @@ class NuisanceMarginOracle:
             self._samples[number] = self.nuisances.sample(self.stream, number, self.objective.space.scene)
         return self._samples[number]
 
-    def _compute_margins(self, theta: Tensor, number: int, sharpness: float | None) -> Tensor:
-        space, sample = self.objective.space, self.sample(number)
-        scene = sample.perturb_scene(space.apply(space.scene, theta))
+    def _margins_together(self, states: Sequence[tuple[Tensor, int, bool]]) -> list[Tensor]:
+        scenes = [self._perturb_scene(theta, number) for theta, number, _ in states]
+        renders = render_batch([(self.objective.compositor, scene) for scene in scenes])
+        samples = [self.sample(number) for _, number, _ in states]
+        images = [sample.degrade_image(render.image) for sample, render in zip(samples, renders, strict=True)]
+        if self.differentiable:
+            detector = self.objective.differentiable
+            raw = detector.forward_for_search(torch.stack(images))
+            candidates = [detector.candidates(raw.select(i)) for i in range(len(images))]
+        else:
+            candidates = self._detect(torch.stack(images))
+        return [
+            self._margins_in_sample(candidates[i], images[i], samples[i], scenes[i], renders[i], None, random)
+            for i, (_, _, random) in enumerate(states)
+        ]
+
+    def _compute_margins(
+        self, theta: Tensor, number: int, sharpness: float | None, random: bool = False
+    ) -> Tensor:
+        scene, sample = self._perturb_scene(theta, number), self.sample(number)
         render = self.objective.compositor.render(scene)
         image = sample.degrade_image(render.image)
         candidates = self._find_candidates(image, number, render)
+        return self._margins_in_sample(candidates, image, sample, scene, render, sharpness, random)
+
+    def _perturb_scene(self, theta: Tensor, number: int) -> SceneIR:
+        space = self.objective.space
+        return self.sample(number).perturb_scene(space.apply(space.scene, theta))
+
+    def _margins_in_sample(
+        self,
+        candidates: Candidates,
+        image: Tensor,
+        sample: NuisanceSample,
+        scene: SceneIR,
+        render: Render,
+        sharpness: float | None,
+        random: bool,
+    ) -> Tensor:
+        """Margins (N,) from the candidates in a sample's image, which enter the search log."""
         rows, boxes_xyxy, margins = self._object_margins(candidates, sample, scene, render, sharpness)
         passes = 1 if sharpness is None else GRADIENT_PASSES
         values = margins.detach()
-        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, values < 0, passes, values)
+        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, values < 0, passes, values, random)
         everywhere = margins.new_full((len(self.counted_objects),), torch.inf)
         return everywhere.index_put((rows.to(margins.device),), margins)
 
+    def _detect(self, images: Tensor) -> list[Candidates]:
+        """Detections in images (C, 3, H, W), as candidates of a detector without any."""
+        classes = self.objective.classes
+        found = predict(self.objective.detector, images)
+        return [
+            losses.candidates_from_detections(classes.map_detections(one), len(classes.names)) for one in found
+        ]
+
     def _find_candidates(self, image: Tensor, number: int, render: Render) -> Candidates:
         if not self.differentiable:
-            classes = self.objective.classes
-            detections = classes.map_detections(predict(self.objective.detector, image[None])[0])
-            return losses.candidates_from_detections(detections, len(classes.names))
+            return self._detect(image[None])[0]
         detector, reference = self.objective.differentiable, None
         if image.requires_grad:
             return detector.candidates(detector(image[None]))

@@ -85,6 +85,8 @@ class _State:
     """Detector passes."""
     margins: Tensor | None
     """(K,) logits."""
+    random: bool
+    """Whether no score influenced the state."""
 
 
 @dataclass
@@ -101,6 +103,7 @@ class SearchLog:
         missed: Tensor,
         passes: int,
         margins: Tensor | None = None,
+        random: bool = False,
     ) -> None:
         """Add an evaluated state.
 
@@ -111,10 +114,11 @@ class SearchLog:
             missed: (K,) bool.
             passes: Detector passes that the state took.
             margins: (K,) logits, where they are known.
+            random: Whether no score influenced the state.
         """
         if len(objects):
             patches = ObjectPatches.from_image(image, boxes_xyxy)
-            self._states.append(_State(objects, patches, missed, passes, margins))
+            self._states.append(_State(objects, patches, missed, passes, margins, random))
 
     def margin_rows(self) -> np.ndarray:
         """(R, F + 1) float32: features of each object in each state with margins, and its margin."""
@@ -134,12 +138,15 @@ class SearchLog:
         if not self._states:
             return ()
         cells = _join([state.patches for state in self._states]).cells()
-        costs = [state.passes for state in self._states for _ in state.objects]
+        states = [state for state in self._states for _ in state.objects]
         objects, missed = (torch.cat([getattr(s, name) for s in self._states]) for name in ("objects", "missed"))
-        counts: dict[tuple[int, Cell], tuple[int, int]] = {}
-        rows = zip(objects.tolist(), cells, costs, missed.tolist(), strict=True)
-        for index, cell, cost, miss in rows:
-            before = counts.get((index, cell), (0, 0))
-            counts[index, cell] = (before[0] + cost, before[1] + miss)
+        counts: dict[tuple[int, Cell], np.ndarray] = {}
+        for index, cell, state, miss in zip(objects.tolist(), cells, states, missed.tolist(), strict=True):
+            row = np.array([state.passes, miss, state.random, state.random and miss])
+            counts[index, cell] = counts.get((index, cell), 0) + row
         ends = set(enumerate(counterexample))
-        return tuple(CellVisit(*pair, *numbers, final=pair in ends) for pair, numbers in sorted(counts.items()))
+        visits: list[CellVisit] = []
+        for pair, row in sorted(counts.items()):
+            passes, misses, random, random_misses = row.tolist()
+            visits.append(CellVisit(*pair, passes, misses, pair in ends, random, random_misses))
+        return tuple(visits)

@@ -296,8 +296,9 @@ class AttackInstance:
         from drivesem.attacks.changes import SAMPLES
 
         oracle = self.margin_oracle
-        samples = (oracle.margins(theta, FIRST_HELD_OUT_SAMPLE + sample) for sample in range(SAMPLES))
-        return sum(margin_objective(margins, oracle.counted_objects) for margins in samples)
+        numbers = range(FIRST_HELD_OUT_SAMPLE, FIRST_HELD_OUT_SAMPLE + SAMPLES)
+        margins = oracle.margins([theta] * SAMPLES, numbers)
+        return sum(margin_objective(row, oracle.counted_objects) for row in margins)
 
 
 @dataclass(frozen=True)
@@ -687,7 +688,7 @@ def summarise_run(
         frames_without_vehicles=0,
         frames_failed={},
         seconds=0.0,
-        rate=estimate_rate(results) if config.samples_states else None,
+        rate=None if config.changes else estimate_rate(results),
         **summarise_frames(results, classes, t_star, headline),
     )
 

@@ -492,14 +492,14 @@ def build_map(results: Sequence[FrameResult]) -> FailureMap:
 
 
 def estimate_rate(results: Sequence[FrameResult]) -> ClusteredShare | None:
-    """Estimate how often a random state loses a vehicle that is found before, from frames that a sampling method
-    attacked to its end. The photographed state is left out.
+    """Estimate how often a random state loses a vehicle that is found before, from the states that no score of the
+    search influenced; for runs without changes of vehicles, which are chosen by scores. None for fewer than two frames
+    with such states.
     """
     counts = []
-    for result in (r for r in results if r.attacked and r.visits):
-        found = set(result.found_before)
-        visits = [visit for visit in result.visits if visit.index in found]
-        counts.append((sum(v.misses for v in visits), sum(v.passes for v in visits) - len(found)))
+    for result in results:
+        visits = [visit for visit in result.visits if visit.index in result.found_before]
+        counts.append((sum(v.random_misses for v in visits), sum(v.random for v in visits)))
     return ClusteredShare.from_frames(counts)
 
 

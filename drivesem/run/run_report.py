@@ -221,7 +221,7 @@ def load_reported_runs(folders: Sequence[str]) -> tuple[list[ReportedRun], int]:
     for run in loaded:
         results = [frame.result for frame in run.frames if frame.result.identifier in shared]
         config = load_attack_config(run.folder, "RUN")
-        rate = estimate_rate(results) if config.samples_states else None
+        rate = None if config.changes else estimate_rate(results)
         summary = replace(_load_summary(run.folder / METRICS), map=build_map(results), rate=rate)
         if len(shared) < len(every):
             summary = _recompute_summary(summary, results)

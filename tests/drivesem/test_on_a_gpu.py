@@ -20,6 +20,7 @@ from drivesem.attacks.objective import Objective
 from drivesem.cli import main
 from drivesem.config.commands import AttackConfig
 from drivesem.failures.certificate import CompositorRenderer, NuisanceCamera, SampleOutcome
+from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
 from drivesem.viewer.scene import InteractiveScene
 from scene_ir.io import load_scene
@@ -189,6 +190,35 @@ def test_a_population_is_scored_together(tmp_path: Path, monkeypatch: pytest.Mon
     assert passes_on_gpu == passes == 6  # and the benign one
     assert there == pytest.approx(here, abs=1e-3)
     assert on_gpu == pytest.approx(theta, abs=1e-6)
+
+
+def test_margins_of_several_points_are_found_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(["attack", "--combo", "1", "--steps", "1", "--no-grade", "--limit", "1"], tmp_path / "run", "cpu")
+    (folder,) = (tmp_path / "run").glob("frames/*/scene")
+
+    def margins(device: str) -> tuple[torch.Tensor, list[int]]:
+        detector, sizes = load_detector("squeezedet", device), list[int]()
+        objective = Objective.from_config(
+            convert_scene(load_scene(folder), None, device), detector, AttackConfig(combo=1, whole=True)
+        )
+        oracle = NuisanceMarginOracle.for_objective(objective, Nuisances(), "test")
+        detect, passes = detector.forward_for_search, objective.passes
+        monkeypatch.setattr(
+            detector, "forward_for_search", lambda images: (sizes.append(len(images)), detect(images))[1]
+        )
+        upper = objective.space.upper
+        found = oracle.margins([0.5 * upper, -0.5 * upper, 0 * upper], [3, 4, 3])
+        assert objective.passes == passes + 3
+        assert len(objective.search_log.margin_rows()) >= 3
+        return found.cpu(), sizes
+
+    here, one_by_one = margins("cpu")
+    with pretended():
+        there, together = margins("cuda")
+    assert one_by_one == [1, 1, 1]
+    assert together == [3]
+    assert bool(torch.isfinite(here).any(1).all())
+    torch.testing.assert_close(there, here, atol=1e-3, rtol=1e-3)
 
 
 @pytest.mark.slow

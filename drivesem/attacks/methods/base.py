@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol, final
 
@@ -105,8 +105,10 @@ class MarginOracle(Protocol):
         """Detector passes so far."""
         ...
 
-    def margins(self, theta: Tensor, number: int) -> Tensor:
-        """Margins (N,) at theta (D,) in a sample; inf for objects that do not count there. Costs a pass."""
+    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int], random: Collection[int] = ()) -> Tensor:
+        """Margins (C, N) at thetas (D,), each in the sample of its number; inf for objects that do not count there.
+        `random` has the places of thetas that no score influenced. Costs C passes.
+        """
         ...
 
     def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:

@@ -69,14 +69,15 @@ class Learn(Climb):
     model: MarginModel | None = None
     """The model."""
 
-    def _start_points(self, search: MarginSearchState, count: int) -> Tensor:
+    def _start_points(self, search: MarginSearchState, count: int) -> tuple[Tensor, range]:
         learned = int(_LEARNED_SHARE * count)
         if self.model is None or not learned:
-            return sample_points(search, count)
+            return Climb._start_points(self, search, count)
         pool = sample_points(search, _POOL)
         predicted = self._predict(self.model, search, pool)
         proposals = [search.combine_objects(pool, *self._choose(search, predicted)) for _ in range(learned)]
-        return torch.cat([torch.stack(proposals), sample_points(search, count - learned)])
+        points = torch.cat([torch.stack(proposals), sample_points(search, count - learned)])
+        return points, range(learned + 1, count, 2)
 
     def _predict(self, model: MarginModel, search: MarginSearchState, pool: Tensor) -> Tensor:
         """Margins (T, C, N) of the points (C, K) by each tree."""

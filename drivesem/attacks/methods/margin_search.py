@@ -6,6 +6,7 @@ Objects are nearly independent, so the worst points of all objects are combined 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -139,31 +140,32 @@ class MarginSearchState:
         self._sample += 1
         return self._sample % _SEARCH_SAMPLES
 
-    def margins(self, point: Tensor, number: int) -> Tensor:
-        """Margins (N,) of the objects at u (K,), in a nuisance sample."""
-        return self.oracle.margins(self.theta(point)[0], number)
+    def margins(self, points: Sequence[Tensor], numbers: Sequence[int], random: Collection[int] = ()) -> Tensor:
+        """Margins (C, N) of the objects at points u (K,), each in the nuisance sample of its number; see
+        `MarginOracle`.
+        """
+        return self.oracle.margins([self.theta(point)[0] for point in points], numbers, random)
 
     def objective(self, margins: Tensor) -> float:
         """See `margin_objective`."""
         return margin_objective(margins, self.oracle.counted_objects)
 
-    def candidates(self, points: Tensor) -> list[Tensor]:
+    def candidates(self, points: Tensor, random: Collection[int] = ()) -> list[Tensor]:
         """The best of the points (C, K), and combinations of the best point of each object with the scene
         coordinates of the best and second-best point. Each point gets another nuisance sample; costs C passes.
+        `random` has the places of points that no score influenced.
         """
-        margins = torch.stack([self.margins(point, self.next_sample()) for point in points])
+        margins = self.margins(list(points), [self.next_sample() for _ in points], random)
         values = [self.objective(row) for row in margins]
         order = sorted(range(len(points)), key=values.__getitem__)
         return [points[order[0]], *(self.combine_objects(points, margins, row) for row in order[:2])]
 
     def select_best(self, points: list[Tensor]) -> Tensor:
         """The point with the lowest mean objective in nuisance samples that the search has not used."""
-        samples = min(_FINAL_SAMPLES, self.passes_left // len(points))
-        values = []
-        for point in points:
-            theta, _ = self.theta(point)
-            numbers = (_SEARCH_SAMPLES + sample for sample in range(samples))
-            values.append(sum(self.objective(self.oracle.margins(theta, number)) for number in numbers))
+        numbers = range(_SEARCH_SAMPLES, _SEARCH_SAMPLES + min(_FINAL_SAMPLES, self.passes_left // len(points)))
+        states = [(self.theta(point)[0], number) for point in points for number in numbers]
+        margins = self.oracle.margins([theta for theta, _ in states], [number for _, number in states])
+        values = [sum(map(self.objective, rows)) for rows in margins.split(len(numbers))]
         return points[min(range(len(points)), key=values.__getitem__)]
 
     def combine_objects(self, points: Tensor, margins: Tensor, scene_row: int) -> Tensor:
@@ -271,29 +273,32 @@ class Climb(MarginSearch):
     """Whether to use gradients where the detector has one."""
 
     def _search(self, search: MarginSearchState) -> Tensor:
-        start = _choose_start(search, self._start_points(search, max(int(_START_SHARE * self.passes), 1)))
+        points = self._start_points(search, max(int(_START_SHARE * self.passes), 1))
+        start = _choose_start(search, *points)
         return _Descent(search, self.gradient and search.oracle.differentiable).descend(start)
 
-    def _start_points(self, search: MarginSearchState, count: int) -> Tensor:
-        """Points (count, K) of which the start is made."""
-        return sample_points(search, count)
+    def _start_points(self, search: MarginSearchState, count: int) -> tuple[Tensor, range]:
+        """Points (count, K) of which the start is made, and the places of those that are uniform in the box."""
+        return sample_points(search, count), range(1, count, 2)
 
 
-def _choose_start(search: MarginSearchState, points: Tensor) -> Tensor:
+def _choose_start(search: MarginSearchState, points: Tensor, random: Collection[int]) -> Tensor:
     """The start u (K,): the best of the candidates that the points (C, K) give."""
-    starts = search.candidates(points)
+    starts = search.candidates(points, random)
     number = search.next_sample()
-    values = [search.objective(search.margins(point, number)) for point in starts]
+    values = [search.objective(row) for row in search.margins(starts, [number] * len(starts))]
     return starts[min(range(len(starts)), key=values.__getitem__)]
 
 
 def sample_points(search: MarginSearchState, count: int) -> Tensor:
-    """Points (count, K): balanced corners and a scrambled Halton sequence alternately."""
+    """Points (count, K): balanced corners and a scrambled Halton sequence alternately, which is uniform in the box."""
     from scipy.stats import qmc  # imported on use: it takes a third of a second to load
 
     box = search.box
     rng = np.random.default_rng(int(torch.randint(2**62, (), generator=search.generator)))
-    points = torch.from_numpy(qmc.Halton(len(box.owner), scramble=True, rng=rng).random(count))
+    points = torch.empty(count, len(box.owner), dtype=torch.float64)
+    # A sequence of its own: every second point of a longer one would stay in one half of the first coordinate.
+    points[1::2] = torch.from_numpy(qmc.Halton(len(box.owner), scramble=True, rng=rng).random(count // 2))
     points[::2] = balanced_corners(box.owner, (count + 1) // 2, search.generator)
     return points.to(box.start)
 
@@ -353,8 +358,8 @@ class _Descent:
         signs = torch.randint(0, 2, (len(point),), generator=self.search.generator) * 2.0 - 1
         direction = signs.to(point) * rough.to(point)
         ahead, behind = ((point + sign * _DIFFERENCE_REACH * direction).clamp(0, 1) for sign in (1, -1))
-        margins_ahead, margins_behind = (
-            self.search.margins(side, number).clamp(-MARGIN_CEILING, MARGIN_CEILING) for side in (ahead, behind)
+        margins_ahead, margins_behind = self.search.margins([ahead, behind], [number, number]).clamp(
+            -MARGIN_CEILING, MARGIN_CEILING
         )
         differences = (margins_ahead - margins_behind).to(point)
         weighted_sum = (differences * _object_weights(margins).to(differences)).sum()

@@ -31,14 +31,13 @@ def views(objective: Objective) -> NuisanceMarginOracle:
 
 
 def test_found_objects_count(views: NuisanceMarginOracle, objective: Objective) -> None:
-    margins = views.margins(objective.space.theta0, 0)
+    (margins,) = views.margins([objective.space.theta0], [0])
     assert margins.shape == views.counted_objects.shape
     assert bool(views.counted_objects.any())
     assert bool(torch.isinf(margins[~views.counted_objects]).all())
     # As photographed, a shift and a little noise lose none of those that are plainly found.
-    still = NuisanceMarginOracle.for_objective(objective, Nuisances.parse("off"), "any").margins(
-        objective.space.theta0, 0
-    )
+    views_without = NuisanceMarginOracle.for_objective(objective, Nuisances.parse("off"), "any")
+    (still,) = views_without.margins([objective.space.theta0], [0])
     assert bool((still[views.counted_objects] > 0).all())
 
 
@@ -57,13 +56,30 @@ def test_the_aim_leaves_others_out(objective: Objective, views: NuisanceMarginOr
 
 def test_a_number_is_one_draw(views: NuisanceMarginOracle, objective: Objective) -> None:
     before = views.passes
-    one, again, other = (views.margins(objective.space.theta0, number) for number in (3, 3, 4))
+    one, again, other = views.margins([objective.space.theta0] * 3, [3, 3, 4])
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
     assert views.passes == before + 3
     # What was kept of a draw changes nothing.
     anew = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search:demo-000:0")
-    assert torch.equal(anew.margins(objective.space.theta0, 3), one)
+    assert torch.equal(anew.margins([objective.space.theta0], [3])[0], one)
+
+
+def random_states(objective: Objective) -> int:
+    return max((visit.random for visit in objective.cell_visits(objective.benign)), default=0)
+
+
+@pytest.mark.parametrize(("method", "expected"), [("random", 2), ("climb", 0)])
+def test_states_that_no_score_influences_are_recorded_as_random(method: str, expected: int) -> None:
+    scene = demo_scene(0, 0)
+    space = ParameterSpace(scene, ("color",))
+    objective = Objective(Compositor(scene), space, load_detector("squeezedet"), AttackConfig(method=method))
+    for share in (0.0, 0.1, 0.2):  # the first is the photograph
+        objective.score(share * space.upper)
+    assert random_states(objective) == expected
+    oracle = NuisanceMarginOracle.for_objective(objective, Nuisances.parse("off"), "any")
+    oracle.margins([0.1 * space.upper, 0.2 * space.upper, 0.3 * space.upper], [0, 1, 2], random=range(1, 2))
+    assert random_states(objective) == expected + 1
 
 
 def test_gradients_against_differences(objective: Objective) -> None:
@@ -99,7 +115,7 @@ def test_only_what_changes_is_seen_again(monkeypatch: pytest.MonkeyPatch) -> Non
     for number in (0, 1):
         for place in (*places, places[-1]):
             torch.testing.assert_close(
-                regional.margins(place, number), whole.margins(place, number), atol=1e-4, rtol=0
+                regional.margins([place], [number]), whole.margins([place], [number]), atol=1e-4, rtol=0
             )
     cached = [regional.cache_mb, whole.cache_mb]
     regional.clear_cache()
@@ -114,20 +130,20 @@ def test_a_picture_seen_again_costs_less_than_a_whole_pass(monkeypatch: pytest.M
     views = NuisanceMarginOracle.for_objective(
         Objective(Compositor(scene), space, detector), Nuisances(), "search"
     )
-    views.margins(space.theta0, 0)
+    views.margins([space.theta0], [0])
 
     def whole(*_: object) -> None:
         raise AssertionError("a whole pass")
 
     monkeypatch.setattr(type(detector), "forward", whole)
-    views.margins(0.1 * space.upper, 0)
+    views.margins([0.1 * space.upper], [0])
     with pytest.raises(AssertionError, match="a whole pass"):  # with a gradient
         views.margins_and_grad(space.theta0, 0, torch.ones(len(views.counted_objects)))
 
 
 def test_weather_has_no_regions(objective: Objective) -> None:
     views = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search")
-    views.margins(0.5 * objective.space.upper, 0)
+    views.margins([0.5 * objective.space.upper], [0])
     cached = views.cache_mb
     assert cached == 0
 
@@ -141,7 +157,7 @@ def test_cached_layers_fit_the_limit() -> None:
     views = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search")
     cached = []
     for number in range(2):
-        views.margins(space.theta0, number)
+        views.margins([space.theta0], [number])
         cached.append(views.cache_mb)
     assert cached[0] == cached[1] > 0
 
@@ -158,7 +174,7 @@ def test_the_benign_picture_counts_and_one_picture_keeps_no_more_than_the_proces
     assert loss == pytest.approx(expected, abs=1e-4)
     torch.testing.assert_close(gradient, slope, atol=1e-3 * float(slope.abs().max()), rtol=1e-3)
     assert 0 < tight.reference_mb <= 10.0
-    views.margins(space.theta0, 0)
+    views.margins([space.theta0], [0])
     assert views.cache_mb == 0
     tight.release_layers()
     assert tight.reference_mb == 0

@@ -56,6 +56,14 @@ def test_visits_count_passes_and_misses_by_object_and_cell() -> None:
     assert SearchLog().visits([]) == ()
 
 
+def test_visits_count_random_states_apart() -> None:
+    log = SearchLog()
+    for misses, random in ((True, False), (True, True), (False, True)):
+        log.record(picture(), torch.tensor([0]), BOXES[:1], torch.tensor([misses]), passes=1, random=random)
+    (visit,) = log.visits([])
+    assert (visit.passes, visit.misses, visit.random, visit.random_misses) == (3, 2, 2, 1)
+
+
 def test_rows_of_margins_are_features_of_the_states_that_have_them() -> None:
     log = SearchLog()
     both, missed = torch.tensor([0, 4]), torch.tensor([False, True])

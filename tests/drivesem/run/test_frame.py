@@ -79,20 +79,17 @@ def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
     assert [model is None for model in models] == [True, True, True, True, False]
 
 
-def sampled(found: tuple[int, ...], *visits: tuple[int, int, int], attacked: bool = True) -> Any:
-    """A frame, and its visits as object, passes and misses; all in one cell."""
-    return SimpleNamespace(
-        attacked=attacked,
-        found_before=found,
-        visits=tuple(CellVisit(index, (0, 0, 0, 0), passes, misses) for index, passes, misses in visits),
-    )
+def sampled(found: tuple[int, ...], *visits: tuple[int, int, int]) -> Any:
+    """A frame, and its visits as object, random states and misses in them, with others; all in one cell."""
+    counts = [CellVisit(index, (0, 0, 0, 0), n + 5, m + 4, random=n, random_misses=m) for index, n, m in visits]
+    return SimpleNamespace(found_before=found, visits=tuple(counts))
 
 
-def test_a_rate_leaves_out_photographed_states_and_objects_missed_there() -> None:
+def test_a_rate_leaves_out_searched_states_and_objects_missed_before() -> None:
     frames = [
-        sampled((0, 2), (0, 9, 1), (1, 1, 1), (2, 4, 0), (2, 5, 3)),  # 8 states, and the photograph
-        sampled((0,), (0, 9, 0)),
-        sampled((0,), (0, 9, 8), attacked=False),
+        sampled((0, 2), (0, 8, 1), (1, 8, 8), (2, 4, 0), (2, 4, 3)),
+        sampled((0,), (0, 8, 0)),
+        sampled((0,), (0, 0, 0)),
     ]
     rate = estimate_rate(frames)
     assert rate is not None

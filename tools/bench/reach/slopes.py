@@ -158,7 +158,7 @@ def _slopes(
         far = steps * (signs[:, None] * directions).sum(dim=0)
         wanted_ends = [torch.minimum(torch.maximum(side * far, space.lower), space.upper) for side in (1, -1)]
         sides = [feasible.project(theta).theta for theta in wanted_ends]
-        one, two = (views.margins(theta, draw) for theta in sides)
+        one, two = views.margins(sides, [draw, draw])
         # How far either went along each way, in steps: bounds and what is feasible may hold it back.
         length = (directions * directions).sum(dim=1)
         wanted, moved = (directions @ (ends[0] - ends[1]) / length for ends in (wanted_ends, sides))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -134,12 +134,13 @@ class SlopeMargins:
         self.world = world
         self.counted_objects, self.differentiable, self.passes = torch.tensor([True]), True, 0
 
-    def margins(self, theta: Tensor, number: int) -> Tensor:
-        self.passes += 1
-        return ((self.world.need - self.world.loss(theta)) / 10 + 0.01 * number)[None]
+    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int], random: Collection[int] = ()) -> Tensor:
+        self.passes += len(thetas)
+        needs = (self.world.need - torch.stack([self.world.loss(theta) for theta in thetas])) / 10
+        return (needs + 0.01 * torch.tensor(numbers))[:, None]
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
-        margins = self.margins(theta, number)
+        (margins,) = self.margins([theta], [number])
         self.passes += 2
         return margins, -weights[0] * SLOPE / STEP / 10
 
@@ -164,6 +165,7 @@ class Street:
     differentiable: bool = True
     passes: int = 0
     thetas: list[Tensor] = field(default_factory=list)
+    random: list[Tensor] = field(default_factory=list)
 
     def known_margins(self, theta: Tensor, number: int) -> Tensor:
         position, paint, weather = theta[POSITION].reshape(CARS, 2), theta[PAINT], theta[WEATHER]
@@ -171,10 +173,11 @@ class Street:
         wave = self.ripple * torch.sin(40 * position + number).sum(dim=1)
         return 3 * distance - 1.0 + 0.5 * paint - 0.3 * weather[0] + wave + 0.05 * (number % 3)
 
-    def margins(self, theta: Tensor, number: int) -> Tensor:
-        self.passes += 1
-        self.thetas.append(theta)
-        return self.known_margins(theta, number)
+    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int], random: Collection[int] = ()) -> Tensor:
+        self.passes += len(thetas)
+        self.random.extend(thetas[i] for i in random)
+        self.thetas.extend(thetas)
+        return torch.stack([self.known_margins(*state) for state in zip(thetas, numbers, strict=True)])
 
     def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
         rows = self.counted_objects.nonzero()[:, 0]

@@ -65,6 +65,15 @@ def test_objects_that_do_not_count_are_left_out_of_predictions() -> None:
     assert street.passes <= 30
 
 
+def test_points_that_the_model_proposes_are_not_random() -> None:
+    one, other = BlindSpot(), BlindSpot()
+    Learn(60, model=MarginModel(spot_rows()))(one.problem(), START, 0)
+    Learn(60, model=MarginModel(1 - spot_rows()))(other.problem(), START, 0)
+    assert len(one.random) == len(other.random) == 6  # of 24 at the start, 12 of the model
+    distances = [min(float((theta - start).norm()) for start in one.thetas[:12]) for theta in one.random]
+    assert min(distances) > 0
+
+
 def test_each_tree_predicts_within_the_range_of_margins() -> None:
     rows = spot_rows()
     rows[::7, -1] = -1e3

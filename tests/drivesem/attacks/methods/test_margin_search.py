@@ -140,6 +140,17 @@ def test_climb_ends_lower_than_its_first_samples(gradient: bool) -> None:
     assert sum(gains) / len(gains) > 0.3, gains
 
 
+def test_random_points_of_a_start_are_uniform_in_the_box_whatever_the_margins() -> None:
+    streets = [Street(), Street(ripple=5.0)]
+    for street in streets:
+        Climb(passes=200)(street.problem(), START, 3)
+    assert len(streets[0].random) == 40
+    assert all(torch.equal(*pair) for pair in zip(streets[0].random, streets[1].random, strict=True))
+    free = torch.stack(streets[0].random)[:, : POSITION.stop]
+    assert float(free.mean(0).abs().max()) < 0.1
+    assert float(free.std(0).min()) > 0.5
+
+
 def test_climb_without_a_gradient() -> None:
     street = Street(differentiable=False)
     street.margins_and_grad = None  # pyright: ignore[reportAttributeAccessIssue]

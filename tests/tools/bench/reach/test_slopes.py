@@ -1,6 +1,6 @@
 """Gradients and slopes of margins that are known in full."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import pytest
@@ -26,8 +26,8 @@ class Margins:
     differentiable: bool = True
     passes: int = 0
 
-    def margins(self, theta: Tensor, number: int) -> Tensor:
-        return self.of(theta) + number
+    def margins(self, thetas: Sequence[Tensor], numbers: Sequence[int]) -> Tensor:
+        return torch.stack([self.of(theta) + number for theta, number in zip(thetas, numbers, strict=True)])
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
         leaf = theta.clone().requires_grad_(True)
