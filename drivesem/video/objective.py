@@ -22,7 +22,9 @@ from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.attacks.space import SPECS, Budget, Parameter, ParameterSpace
 from drivesem.attacks.theta import ParameterSpec, ProjectedTheta, ThetaSpace
 from drivesem.config.commands import AttackConfig, DriveConfig
+from drivesem.config.errors import UsageError
 from drivesem.evaluation.failures import match_detections
+from drivesem.reporting.tables import format_count
 from drivesem.video.clips import DerenderedClip
 from scene_ir import ffd
 from scene_ir.errors import RangeError
@@ -278,7 +280,7 @@ class ClipObjective:
     """The objective that an attack on a clip maximises.
 
     Each gradient step uses `config.keys` evenly spaced frames, other ones in turn. `on_frame` is called for each
-    evaluated frame. Raises as `Objective` does.
+    evaluated frame. Raises as `Objective` does, and UsageError for a clip in which no targeted object counts.
     """
 
     def __init__(
@@ -300,6 +302,10 @@ class ClipObjective:
             Objective(Compositor(scene), ParameterSpace(scene, params, budget), detector, settings)
             for scene in clip.scenes
         ]
+        if not any(objective.judged for objective in self.frames):
+            kinds = config.target_classes or "objects"
+            found = f"none in {format_count(len(self.frames), 'frame')}"
+            raise UsageError("CLIP", f"{kinds} that are large and visible enough to count", found)
         spaces = [objective.space for objective in self.frames]
         self.space = ClipSpace(spaces, clip.tracks, config.bend, clip.background_people)
         self.sets: list[FeasibleSet] = [

@@ -19,7 +19,6 @@ from drivesem.attacks.methods.gradient_free import Placebo
 from drivesem.attacks.targets import resolve_t_star
 from drivesem.config.commands import AttackConfig, DriveConfig
 from drivesem.config.devices import check_device
-from drivesem.config.errors import UsageError
 from drivesem.failures.certificate import CompositorRenderer
 from drivesem.failures.grades import Grade
 from drivesem.reporting.drawing import write_picture
@@ -82,10 +81,6 @@ def attack_clip(config: DriveConfig) -> AnalysisReport:
     clip = derender_clip(derenderer, config)
     clip = replace(clip, scenes=convert_scene(clip.scenes, None, detector_device(detector)))
     objective = ClipObjective(clip, detector, params, budget, config)
-    if not any(frame.judged for frame in objective.frames):
-        kinds = config.target_classes or "objects"
-        found = f"none in {format_count(len(clip.names), 'frame')}"
-        raise UsageError("CLIP", f"{kinds} that are large and visible enough to count", found)
     problem, theta0 = objective.problem(config.keep == "last"), objective.space.theta0
     recorder, control = _ClipRecorder(clip, objective, out), theta0
     with progress_bar(Console(stderr=True)) as progress:

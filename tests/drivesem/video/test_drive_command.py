@@ -20,6 +20,7 @@ from detectors.registry import load_predictor
 from drivesem.attacks.space import Budget, Parameter
 from drivesem.cli import main
 from drivesem.config.commands import DriveConfig
+from drivesem.config.errors import UsageError
 from drivesem.run.records import from_json
 from drivesem.synth.write import Order, synthesise
 from drivesem.video import clips as taking
@@ -131,6 +132,16 @@ def test_only_targeted_classes_count(street: Callable[..., SceneIR]) -> None:
     detection = objective.match_frame(0, objective.frames[0].benign)
     assert detection.counted == (False, True, False)
     assert objective.space.count == 3
+    with pytest.raises(
+        UsageError, match="Truck that are large and visible enough to count, found none in 1 frame"
+    ):
+        ClipObjective(
+            clip,
+            load_predictor("squeezedet"),
+            (Parameter.COLOR,),
+            Budget(),
+            replace(config, target_classes="Truck"),
+        )
 
 
 def test_the_table_names_cars(finished: Path) -> None:
