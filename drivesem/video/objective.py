@@ -303,7 +303,7 @@ class ClipObjective:
             for scene in clip.scenes
         ]
         if not any(objective.judged for objective in self.frames):
-            kinds = config.target_classes or "objects"
+            kinds = f"objects of {config.target_classes}" if config.target_classes else "objects"
             found = f"none in {format_count(len(self.frames), 'frame')}"
             raise UsageError("CLIP", f"{kinds} that are large and visible enough to count", found)
         spaces = [objective.space for objective in self.frames]

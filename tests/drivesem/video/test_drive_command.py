@@ -133,7 +133,7 @@ def test_only_targeted_classes_count(street: Callable[..., SceneIR]) -> None:
     assert detection.counted == (False, True, False)
     assert objective.space.count == 3
     with pytest.raises(
-        UsageError, match="Truck that are large and visible enough to count, found none in 1 frame"
+        UsageError, match="objects of Truck that are large and visible enough to count, found none in 1 frame"
     ):
         ClipObjective(
             clip,
