@@ -1,7 +1,8 @@
-"""The README's picture: one frame of a run before and after, with true and detected boxes. Its caption is printed, and
-is the JPEG's comment: the README has the same text.
+"""A picture for README or docs: one frame of a run before and after, with true and detected boxes. Its caption is
+printed, and is the JPEG's comment: the page has the same text.
 
 python tools/example_picture.py runs/demo-color-weather-translate-rotate-climb-seed0 demo-003 docs/example.jpg
+python tools/example_picture.py runs/crossing 000000 docs/crossing.jpg --quality 80
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from drivesem.run.report.page import name_failure
 from drivesem.run.results import Failure, FrameResult, load_frame
 from scene_ir import files
 
-JPEG_QUALITY = 88
 GAP_PX = 6
 
 
@@ -64,13 +64,14 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("frame")
     parser.add_argument("out", type=Path)
+    parser.add_argument("--quality", type=int, default=88)
     arguments = parser.parse_args()
     result = load_frame(arguments.run / "frames" / arguments.frame / "result.json")
     attack = load_attack_config(arguments.run)
     command = format_command_line("attack", attack, set(PRESENTATION) - {"limit"})
     caption = write_caption(command, result)
     picture = Image.fromarray(draw_example(arguments.run, result))
-    picture.save(arguments.out, "JPEG", quality=JPEG_QUALITY, comment=caption.encode())
+    picture.save(arguments.out, "JPEG", quality=arguments.quality, comment=caption.encode())
     print(caption)
 
 

@@ -53,6 +53,7 @@ from drivesem.config.options import (
     SceneAttackOptions,
     SceneOptions,
     SearchOptions,
+    TargetClassesOption,
     ThresholdOption,
     TileOption,
     TrainingOptions,
@@ -96,7 +97,7 @@ Stage = Literal["attacked", "attacked-paper", "rerendered", "benign"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandConfig):
+class AttackConfig(TileOption, GradingOptions, TargetClassesOption, SceneAttackOptions, FrameCommandConfig):
     """Search for feasible scene changes that make a detector fail."""
 
     basic: ClassVar[tuple[str, ...]] = (
@@ -140,8 +141,6 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     """Mesh of a vehicle that --changes adds: OBJ, GLB or PLY in metres (default: the templates)."""
     target_objects: str | None = None
     """Objects that count as failures when lost, such as 0,2; phantoms do not count then."""
-    target_classes: str | None = None
-    """Classes in which lost objects and phantoms count as failures, such as Car,Pedestrian."""
     backend: Literal["warp", "reference"] = "warp"
     """Renderer: the fast kernels, or the plain torch reference that defines them."""
 
@@ -149,11 +148,6 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
     """Folder or URL of the results; the same command resumes what it finds there."""
     part: Annotated[str | None, ParsedBy(parse_part)] = None
     """Part of the frames for one of several machines: K/N is every N-th, from the K-th (drivesem runs merge)."""
-
-    @property
-    def moves_people(self) -> bool:
-        named = (self.target_classes or "").split(",")
-        return self.people or any(name.strip() in ("Pedestrian", "Cyclist") for name in named)
 
     @property
     def samples_states(self) -> bool:
@@ -181,8 +175,8 @@ class AttackConfig(TileOption, GradingOptions, SceneAttackOptions, FrameCommandC
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveConfig(TileOption, SearchOptions, FrameCommandConfig):
-    """Attack a video clip with one consistent change per vehicle."""
+class DriveConfig(TileOption, TargetClassesOption, SearchOptions, FrameCommandConfig):
+    """Attack a video clip with one consistent change per vehicle, or person."""
 
     basic: ClassVar[tuple[str, ...]] = (
         *("clip", "sequence", "limit", "detector", "combo", "params", "budget", "method", "steps", "queries"),
@@ -202,7 +196,7 @@ class DriveConfig(TileOption, SearchOptions, FrameCommandConfig):
     queries: Annotated[Count, OnlyWith("method", QUERY_METHODS)] | None = None
     """Query budget of gradient-free methods, in evaluated clips (default: 64)."""
     bend: Annotated[int, NumberRange(0, 5, expected="0 to 5")] = 3
-    """Degree of the polynomial of a vehicle's path over time; 0: the same offset in all frames."""
+    """Degree of the polynomial of an object's path over time; 0: the same offset in all frames."""
     keys: Count = 8
     """Frames per gradient step, evenly spread and different in each step."""
     certify: NotNegative = 6
@@ -216,6 +210,7 @@ class DriveConfig(TileOption, SearchOptions, FrameCommandConfig):
         super().check()
         refuse(None not in (self.combo, self.params), "--params", "no --combo", f"--combo {self.combo}")
         refuse(self.sequence is not None and self.clip is None, "--sequence", "a CLIP", "none")
+        refuse(self.moves_people and self.clip is None, "--people", "a CLIP with people", "none")
 
 
 @dataclass(frozen=True, kw_only=True)

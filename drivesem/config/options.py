@@ -242,13 +242,37 @@ class FrameFilterOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(FrameFilterOptions, DataSourceOptions):
+class PeopleOption(Options):
+    """Whether people move."""
+
+    people: Flag = False
+    """Make objects of labelled pedestrians and cyclists too; --target-classes with one of them does it as well."""
+
+    @property
+    def moves_people(self) -> bool:
+        """Whether people and cyclists become objects."""
+        return self.people
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetClassesOption(PeopleOption):
+    """Which classes an attack targets."""
+
+    target_classes: str | None = None
+    """Classes in which lost objects and phantoms count as failures, such as Car,Pedestrian."""
+
+    @property
+    def moves_people(self) -> bool:
+        named = (self.target_classes or "").split(",")
+        return self.people or any(name.strip() in ("Pedestrian", "Cyclist") for name in named)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(PeopleOption, FrameFilterOptions, DataSourceOptions):
     """Where frames come from, and how photographs become scenes."""
 
     fit: bool = True
     """Fit template, pose and shape to the silhouettes in photographs."""
-    people: Flag = False
-    """Make objects of labelled pedestrians and cyclists too; --target-classes with one of them does it as well."""
     cache: str | None = None
     """Folder that stores de-rendered photographs for later runs."""
     cache_gb: Annotated[float, NumberRange(0, ends="()", expected="a number above 0")] = 4.0
@@ -257,11 +281,6 @@ class SceneOptions(FrameFilterOptions, DataSourceOptions):
     """Focal length of photographs without a camera, px (default: EXIF's, or 0.58 of the longer side)."""
     finder: str = DEFAULT_FINDER
     """Detector that finds vehicles in --dataset photographs."""
-
-    @property
-    def moves_people(self) -> bool:
-        """Whether people and cyclists become objects."""
-        return self.people
 
     def check(self) -> None:
         super().check()

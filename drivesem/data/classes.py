@@ -115,6 +115,18 @@ def rename_to_types(labels: Labels, mapping: Mapping[str, str | None]) -> Labels
     return replace(labels, kind=tuple(kinds))
 
 
+def rider_rows(labels: Labels, mapping: Mapping[str, str | None]) -> list[int]:
+    """Return the rows of cyclists without their two-wheelers, by the data set's class names.
+
+    Args:
+        labels: Labels with the data set's class names.
+        mapping: New names, from `--map`; `rider=Cyclist` takes riders for whole.
+    """
+    return [
+        row for row, kind in enumerate(labels.kind) if (mapping.get(kind, kind) or "").strip().lower() == "rider"
+    ]
+
+
 def select_road_users(labels: Labels) -> Labels:
     """Rename objects to their types, and drop those without a type, which are background."""
     labels = rename_to_types(labels, {})

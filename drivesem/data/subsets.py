@@ -13,7 +13,7 @@ from drivesem.config.constraints import is_url, parse_attributes, parse_class_ma
 from drivesem.config.options import FrameFilterOptions
 from drivesem.data import kitti_tracking
 from drivesem.data.account import DataAccount, sum_accounts
-from drivesem.data.classes import check_class_map, rename_to_types
+from drivesem.data.classes import check_class_map, rename_to_types, rider_rows
 from drivesem.data.kitti import KittiDataset
 from drivesem.data.label_table import select_by_attributes
 from drivesem.data.layouts import detect_layout
@@ -95,8 +95,12 @@ class DatasetSelection:
     def frame(self, identifier: str) -> Frame:
         """Read one frame. Raises FormatError naming a damaged file."""
         frame = self._dataset.frame(identifier)
-        labels = None if frame.labels is None else rename_to_types(frame.labels, self._choice.mapping)
-        return replace(frame, labels=labels, attributes=self._dataset.attributes(identifier))
+        attributes, mapping = self._dataset.attributes(identifier), self._choice.mapping
+        if frame.labels is None:
+            return replace(frame, attributes=attributes)
+        riders = {f"labels[{row}].name": "rider" for row in rider_rows(frame.labels, mapping)}
+        labels = rename_to_types(frame.labels, mapping)
+        return replace(frame, labels=labels, attributes=attributes, provenance={**frame.provenance, **riders})
 
 
 def open_selection(

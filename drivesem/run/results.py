@@ -317,7 +317,9 @@ class RunSummary:
         """The rate in one line, "" without one."""
         if self.rate is None:
             return ""
-        share, low, high = (f"{100 * end:.2g}" for end in (self.rate.value, self.rate.low, self.rate.high))
+        share, low, high = (
+            f"{round(100 * end, 6):.3g}" for end in (self.rate.value, self.rate.low, self.rate.high)
+        )
         draws = f"{self.rate.draws:,} {self.noun}s in random states of {self.rate.frames} frames"
         return f"rate: {self.rate.failing:,} of {draws} missed ({share} % [{low}, {high}])"
 

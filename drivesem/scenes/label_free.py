@@ -25,6 +25,7 @@ from drivesem.data.ground_truth import occlusion_from_visible
 from drivesem.data.label_table import UNKNOWN_OCCLUSION
 from scene_ir.derender import ego
 from scene_ir.derender.derender import DerenderSettings
+from scene_ir.derender.people import join_riders
 from scene_ir.derender.pose import BORDER_PX, VehiclePoses, back_project, estimate_poses
 from scene_ir.derender.silhouette import FitSettings
 from scene_ir.errors import RangeError
@@ -186,10 +187,11 @@ def estimate_label_poses(frame: Frame) -> Frame:
     assert frame.labels is not None
     labels = rename_to_types(frame.labels, {})
     boxes = labels.boxes_xyxy.float()
+    whole, _ = join_riders(labels)
     flat = (boxes[:, 2:] <= boxes[:, :2]).any(1).tolist()
     names = ["" if thin else name for name, thin in zip(labels.kind, flat, strict=True)]
     # poses of nearer vehicles, which have higher boxes, are more reliable
-    placed = _place_objects(frame, boxes, names, boxes[:, 3] - boxes[:, 1], None, rounds=1)
+    placed = _place_objects(frame, whole.float(), names, boxes[:, 3] - boxes[:, 1], None, rounds=1)
     dropped = ~placed.possible
     depth = torch.where(dropped, math.inf, placed.translation[:, 2])
     unknown = labels.occlusion == UNKNOWN_OCCLUSION

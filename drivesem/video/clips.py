@@ -1,4 +1,4 @@
-"""De-renders a clip frame by frame, with one mesh and one size per car in all of its frames."""
+"""De-renders a clip frame by frame, with one mesh and one size per vehicle in all of its frames."""
 
 from __future__ import annotations
 
@@ -47,6 +47,8 @@ class ClipSource:
     """Whether to fit shapes."""
     keep_going: bool
     """Whether to skip frames that cannot be used."""
+    people: bool = False
+    """Whether people and cyclists become objects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,8 @@ class DerenderedClip:
     """Scene of each frame."""
     tracks: tuple[tuple[int, ...], ...]
     """Track of each object in each frame."""
+    background_people: tuple[frozenset[int], ...] = ()
+    """Tracks of the people in each frame that stay in its background; empty if there are none."""
     failed: dict[str, str] = field(default_factory=dict)
     """Why other frames could not be used."""
 
@@ -86,15 +90,15 @@ class _DemoFrames:
 class _LabelledFrames:
     """Frames of a labelled clip.
 
-    A car takes its shape and size from the frame that shows it best, and its pose from each frame's label: poses
-    fitted frame by frame differ, and cars would jitter.
+    A vehicle takes its shape and size from the frame that shows it best, and its pose from each frame's label: poses
+    fitted frame by frame differ, and vehicles would jitter. A person moves arms and legs, and is cut out of each frame.
     """
 
     def __init__(self, source: ClipSource) -> None:
         self._clip = select_clip(find_clips(source.folder or ""), source.name)
         self.name = self._clip.name
         self.names = self._clip.frames[: source.limit]
-        self._fit = source.fit
+        self._fit, self._people = source.fit, source.people
         self._passed_over = (SceneError,) if source.keep_going else ()
         self._shapes: dict[int, Placement] | None = None
 
@@ -102,7 +106,8 @@ class _LabelledFrames:
         labels, tracks = _load_labels(self._clip, name), self._clip.tracks(name)
         known = [self._place_vehicle(labels, row, track) for row, track in enumerate(tracks)]
         frame = self._clip.dataset.frame(name)
-        scene = derender(frame, replace(DerenderSettings.fast(), known_placements=tuple(known)))
+        settings = replace(DerenderSettings.fast(), known_placements=tuple(known), people=self._people)
+        scene = derender(frame, settings)
         return replace(scene, provenance=dict(scene.provenance) | {_TRACKS: ",".join(map(str, tracks))})
 
     def camera(self) -> Camera | None:
@@ -131,7 +136,7 @@ class _LabelledFrames:
                 track: next((shapes for name in names if (shapes := load(name)) is not None), {})
                 for track, names in self._rank_frames().items()
             }
-            # assigned at once: a partial result would leave cars of other frames without a shape
+            # assigned at once: a partial result would leave vehicles of other frames without a shape
             self._shapes = {track: shapes[track] for track, shapes in best.items() if track in shapes}
         return self._shapes
 
@@ -206,9 +211,15 @@ def derender_clip(work: ClipDerenderer, workers: WorkerOptions) -> DerenderedCli
     scenes = tuple(load_scene(out / name) for name in usable)
     if not any(len(scene.objects) for scene in scenes):
         found = next(iter(failed.values()), f"none in {format_count(len(usable), 'frame')}")
-        raise UsageError("CLIP", "frames with cars, vans or trucks that can be de-rendered", found)
+        kinds = "cars, vans, trucks or people" if source.people else "cars, vans or trucks"
+        raise UsageError("CLIP", f"frames with {kinds} that can be de-rendered", found)
     return DerenderedClip(
-        work.frames.name, usable, scenes, tuple(object_tracks(scene) for scene in scenes), failed
+        work.frames.name,
+        usable,
+        scenes,
+        tuple(map(object_tracks, scenes)),
+        tuple(map(background_people, scenes)),
+        failed,
     )
 
 
@@ -227,3 +238,11 @@ def object_tracks(scene: SceneIR) -> tuple[int, ...]:
     """Read the tracks of a scene's objects from its provenance."""
     tracks = scene.provenance[_TRACKS].split(",")
     return tuple(int(tracks[int(scene.provenance[f"objects[{i}].label"])]) for i in range(len(scene.objects)))
+
+
+def background_people(scene: SceneIR) -> frozenset[int]:
+    """Read the tracks of the people who stay in a scene's background from its provenance."""
+    tracks = scene.provenance[_TRACKS].split(",")
+    return frozenset(
+        int(track) for row, track in enumerate(tracks) if f"labels[{row}].background" in scene.provenance
+    )

@@ -1,13 +1,14 @@
-"""The objective of a clip: from its theta, one change per car, to the mean loss of its frames.
+"""The objective of a clip: from its theta, one change per track, to the mean loss of its frames.
 
-A car's paint, shape, heading and size change equally in all of its frames, as do weather, foliage and sun. Its place
-follows a smooth path: Bernstein polynomials over the time in which it is visible, with control points as coordinates
-of theta. Their weights sum to one, so a path stays within the bounds of its control points.
+The paint, shape, heading and size of an object change equally in all of its frames, as do weather, foliage and sun. Its
+place follows a smooth path: Bernstein polynomials over the time in which it is visible, with control points as
+coordinates of theta. Their weights sum to at most one, so a path stays within the bounds of its control points. A
+person's path begins and ends at the labelled place next to frames in which the person stays in the background.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import comb
 
@@ -21,7 +22,9 @@ from drivesem.attacks.objective import Objective, RenderEvaluation
 from drivesem.attacks.space import SPECS, Budget, Parameter, ParameterSpace
 from drivesem.attacks.theta import ParameterSpec, ProjectedTheta, ThetaSpace
 from drivesem.config.commands import AttackConfig, DriveConfig
+from drivesem.config.errors import UsageError
 from drivesem.evaluation.failures import match_detections
+from drivesem.reporting.tables import format_count
 from drivesem.video.clips import DerenderedClip
 from scene_ir import ffd
 from scene_ir.errors import RangeError
@@ -31,21 +34,30 @@ _INSIDE = 1 - 1e-5
 """Factor on a path's bounds, as the sum of its weights is rounded."""
 _SAME = 1e-6
 """Tolerance within which a frame's projection did not change theta."""
+_FADE_FRAMES = 10
+"""Frames in which a person's path returns to the labelled place: a second."""
 _ROUNDS = 8
-"""Rounds in which the limits of frames are applied to the clip, in the second half to whole paths; afterwards, cars
-that still violate a constraint lose their changes of shape and place."""
+"""Rounds in which the limits of frames are applied to the clip, in the second half to whole paths; afterwards,
+objects that still violate a constraint lose their changes of shape and place."""
 
 
 class ClipSpace(ThetaSpace[Parameter]):
-    """Parameters of a clip; bounds are the tightest of a car's frames."""
+    """Parameters of a clip; bounds are the tightest of an object's frames."""
 
-    def __init__(self, spaces: Sequence[ParameterSpace], tracks: Sequence[Sequence[int]], bend: int = 3) -> None:
+    def __init__(
+        self,
+        spaces: Sequence[ParameterSpace],
+        tracks: Sequence[Sequence[int]],
+        bend: int = 3,
+        background_people: Sequence[Collection[int]] = (),
+    ) -> None:
         """Combine the spaces of frames.
 
         Args:
             spaces: Space of each frame's scene, with equal parameters and budgets.
             tracks: Track of each object in each frame.
             bend: Degree of a path's polynomial; 0 for a constant offset.
+            background_people: Tracks of the people that stay in the background of each frame; empty if there are none.
         """
         if bend < 0 or not spaces:
             raise RangeError("clip", "frames, and a bend of at least 0", f"{len(spaces)} frames, {bend}")
@@ -56,20 +68,20 @@ class ClipSpace(ThetaSpace[Parameter]):
         super().__init__(spaces[0].params, _specs(spaces[0].specs, self.points), len(self.tracks), like)
         places = ([self.tracks.index(track) for track in of_frame] for of_frame in tracks)
         self.rows = [torch.tensor(of_frame, dtype=torch.int64, device=like.device) for of_frame in places]
-        self._weights = _path_weights(self.tracks, tracks, self.points, like)
+        self._weights = _path_weights(self.tracks, tracks, self.points, like, background_people)
         self.lower.fill_(-torch.inf)
         self.upper.fill_(torch.inf)
         for space, rows in zip(self.spaces, self.rows, strict=True):
             for parameter in self.params:
                 self._tighten(parameter, space, rows)
         for bound in (self.lower, self.upper):
-            bound[~bound.isfinite()] = 0  # cars without any frame do not occur
+            bound[~bound.isfinite()] = 0  # objects without any frame do not occur
 
     def name(self, i: int) -> str:
-        """The name of coordinate `i`, by the car's track: `cars[12].translate.along[0]`."""
+        """The name of coordinate `i`, by the object's track: `tracks[12].translate.along[0]`."""
         parameter, owner, k = self._locate(i)
         spec = self.specs[parameter]
-        return f"cars[{self.tracks[owner]}].{spec.names[k]}" if spec.per_object else spec.names[k]
+        return f"tracks[{self.tracks[owner]}].{spec.names[k]}" if spec.per_object else spec.names[k]
 
     def frame_theta(self, theta: Tensor, frame: int) -> Tensor:
         """Convert theta (D,) to a frame's own space (D',); differentiable."""
@@ -117,13 +129,13 @@ class ClipSpace(ThetaSpace[Parameter]):
                 block.copy_(there)
         return theta
 
-    def reset_geometry(self, theta: Tensor, cars: Tensor) -> Tensor:
-        """theta (D,) without changes of shape and place of the chosen cars (N,) bool."""
+    def reset_geometry(self, theta: Tensor, chosen: Tensor) -> Tensor:
+        """theta (D,) without changes of shape and place of the chosen objects (N,) bool."""
         theta = theta.clone()
         for parameter in self.params:
             block = self.block(theta, parameter)
             if block is not None and SPECS[parameter].per_object and parameter is not Parameter.COLOR:
-                block[cars] = 0
+                block[chosen] = 0
         return theta
 
     def path_offsets(self, theta: Tensor, frame: int) -> Tensor:
@@ -134,7 +146,7 @@ class ClipSpace(ThetaSpace[Parameter]):
         return length_m.new_zeros(len(length_m), 2) if offset is None else offset * length_m
 
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
-        """Value in metres, degrees or percent, measured in the first frame with the car."""
+        """Value in metres, degrees or percent, measured in the first frame with the object."""
         parameter, owner, k = self._locate(i)
         spec = SPECS[parameter]
         if not spec.per_object:
@@ -206,31 +218,44 @@ def _differing(space: ParameterSpace, one: Tensor, other: Tensor) -> Tensor:
 
 
 def _renamed(name: str, space: ClipSpace, frame: int) -> str:
-    """Convert `objects[3]: collision` of a frame to the car's name."""
+    """Convert `objects[3]: collision` of a frame to the name of the track."""
     if not name.startswith("objects["):
         return name
     index, _, rest = name.removeprefix("objects[").partition("]")
-    return f"cars[{space.tracks[int(space.rows[frame][int(index)])]}]{rest}"
+    return f"tracks[{space.tracks[int(space.rows[frame][int(index)])]}]{rest}"
 
 
 def _specs(specs: Mapping[Parameter, ParameterSpec], points: int) -> dict[Parameter, ParameterSpec]:
-    """The specifications of the parameters, for cars instead of objects."""
+    """The specifications of the parameters, for tracks instead of objects."""
     names = tuple(f"{name}[{k}]" for k in range(points) for name in SPECS[Parameter.TRANSLATE].names)
-    path = ParameterSpec(2 * points, True, SPECS[Parameter.TRANSLATE].unit, names, "cars")
-    return {p: replace(spec, owner="cars") for p, spec in specs.items()} | {Parameter.TRANSLATE: path}
+    path = ParameterSpec(2 * points, True, SPECS[Parameter.TRANSLATE].unit, names, "tracks")
+    return {p: replace(spec, owner="tracks") for p, spec in specs.items()} | {Parameter.TRANSLATE: path}
 
 
-def _path_weights(cars: Sequence[int], tracks: Sequence[Sequence[int]], points: int, like: Tensor) -> list[Tensor]:
-    """For each frame the weights (n, K) of its objects' control points, by the time since each was first seen."""
-    seen = {car: [f for f, of_frame in enumerate(tracks) if car in of_frame] for car in cars}
+def _path_weights(
+    names: Sequence[int],
+    tracks: Sequence[Sequence[int]],
+    points: int,
+    like: Tensor,
+    background_people: Sequence[Collection[int]],
+) -> list[Tensor]:
+    """For each frame the weights (n, K) of its objects' control points, by the time since each was first seen, and by
+    the time to the nearest frame in which a person stays in the background.
+    """
+    seen, left_out = (
+        {track: [f for f, of_frame in enumerate(frames) if track in of_frame] for track in names}
+        for frames in (tracks, background_people)
+    )
     found = []
     for frame, of_frame in enumerate(tracks):
         weights = like.new_zeros(len(of_frame), points)
-        for row, car in enumerate(of_frame):
-            first, last = seen[car][0], seen[car][-1]
+        for row, track in enumerate(of_frame):
+            first, last = seen[track][0], seen[track][-1]
             u = (frame - first) / max(last - first, 1)
             n = points - 1
-            weights[row] = like.new_tensor([comb(n, k) * u**k * (1 - u) ** (n - k) for k in range(points)])
+            fade = min([abs(frame - other) / _FADE_FRAMES for other in left_out[track]], default=1.0)
+            bernstein = [comb(n, k) * u**k * (1 - u) ** (n - k) for k in range(points)]
+            weights[row] = min(fade, 1.0) * like.new_tensor(bernstein)
         found.append(weights)
     return found
 
@@ -255,7 +280,7 @@ class ClipObjective:
     """The objective that an attack on a clip maximises.
 
     Each gradient step uses `config.keys` evenly spaced frames, other ones in turn. `on_frame` is called for each
-    evaluated frame. Raises as `Objective` does.
+    evaluated frame. Raises as `Objective` does, and UsageError for a clip in which no targeted object counts.
     """
 
     def __init__(
@@ -267,13 +292,22 @@ class ClipObjective:
         config: DriveConfig,
     ) -> None:
         settings = AttackConfig(
-            objective_labels=config.objective_labels, objective=config.objective, t_star=config.t_star, whole=True
+            objective_labels=config.objective_labels,
+            objective=config.objective,
+            t_star=config.t_star,
+            target_classes=config.target_classes,
+            whole=True,
         )
         self.frames = [
             Objective(Compositor(scene), ParameterSpace(scene, params, budget), detector, settings)
             for scene in clip.scenes
         ]
-        self.space = ClipSpace([objective.space for objective in self.frames], clip.tracks, config.bend)
+        if not any(objective.judged for objective in self.frames):
+            kinds = f"objects of {config.target_classes}" if config.target_classes else "objects"
+            found = f"none in {format_count(len(self.frames), 'frame')}"
+            raise UsageError("CLIP", f"{kinds} that are large and visible enough to count", found)
+        spaces = [objective.space for objective in self.frames]
+        self.space = ClipSpace(spaces, clip.tracks, config.bend, clip.background_people)
         self.sets: list[FeasibleSet] = [
             objective.feasible_set(only_bounds=config.project == "bounds") for objective in self.frames
         ]
@@ -349,7 +383,7 @@ class ClipObjective:
         """Match the detections of a rendered frame."""
         objective = self.frames[frame]
         count = len(objective.space.scene.objects)
-        targets = objective.classes.map_targets(rendered.moved.targets)
+        targets = objective.classes.map_targets(objective.aim.targets(rendered.moved.targets))
         found = match_detections(targets, rendered.detections, objective.t_star).detected[:count]
         failed = objective.failures(rendered, "moved")
         return FrameDetection(
@@ -370,7 +404,7 @@ class ClipObjective:
             phantoms=detection.phantoms,
             success=bool(detection.lost or detection.phantoms),
             success_paper=paper.success,
-            violations=tuple(f"cars[{track}]: visibility" for track in tracks),
+            violations=tuple(f"tracks[{track}]: visibility" for track in tracks),
         )
 
     def _group(self, parameter: Parameter, where: slice) -> ParameterGroup:

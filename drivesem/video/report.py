@@ -1,4 +1,4 @@
-"""Results of a clip, car by car, and their report: a table, an HTML page with a slider, and a video."""
+"""Results of a clip, object by object, and their report: a table, an HTML page with a slider, and a video."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import numpy as np
 from markupsafe import Markup
 from rich import box
 
+from drivesem.data.classes import PEOPLE
 from drivesem.reporting import web
 from drivesem.reporting.tables import AnalysisReport, ReportTable, format_count
 from drivesem.run.folder import FRAMES
@@ -24,7 +25,7 @@ from scene_ir.errors import WriteError
 from scene_ir.raster.launch import suppress_stderr
 
 FOUND, LOST, UNCOUNTED, ABSENT = "f", "l", "-", " "
-"""State of a car in one frame: detected; missed; too small, hidden or truncated to count; absent."""
+"""State of an object in one frame: detected; missed; too small, hidden or truncated to count; absent."""
 State = Literal["before", "after", "control"]
 STATES: tuple[State, ...] = ("before", "after", "control")
 """The original clip, the attacked one, and one with a random change of the same size."""
@@ -32,7 +33,7 @@ STATES: tuple[State, ...] = ("before", "after", "control")
 
 @dataclass(frozen=True, slots=True)
 class MissedInterval:
-    """How long a car is missed in a clip."""
+    """How long an object is missed in a clip."""
 
     frames: int
     """Frames in which it counts."""
@@ -70,8 +71,8 @@ def _metres(distances: Iterable[float]) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class CarResult:
-    """Result of one car; see `MissedInterval` for lost, longest and metres, and `STATES` for their suffixes."""
+class TrackResult:
+    """Result of one object; see `MissedInterval` for lost, longest and metres, and `STATES` for their suffixes."""
 
     track: int
     """Its number in the data."""
@@ -92,7 +93,7 @@ class CarResult:
     longest_control: int
     """Longest run of misses with the random change, frames."""
     metres: float
-    """Approach of the camera while the car counts, m."""
+    """Approach of the camera while the object counts, m."""
     metres_lost_before: float
     """Approach while it is missed in the original clip, m."""
     metres_lost_after: float
@@ -119,8 +120,8 @@ class CarResult:
         distance_m: tuple[float | None, ...],
         path_m: tuple[tuple[float, float] | None, ...],
         certain: Sequence[bool],
-    ) -> CarResult:
-        """Measure a car.
+    ) -> TrackResult:
+        """Measure an object.
 
         Args:
             track: Its number in the data.
@@ -175,8 +176,8 @@ class DriveResult:
     """Number of frames."""
     names: tuple[str, ...]
     """Names of the frames."""
-    cars: tuple[CarResult, ...]
-    """Results by car, the most missed first."""
+    tracks: tuple[TrackResult, ...]
+    """Results by object, the most missed first."""
     phantoms: dict[str, int]
     """Phantoms in all frames, by `STATES`."""
     feasible: int
@@ -198,13 +199,18 @@ class DriveResult:
     seconds: float
     """Run time, s."""
 
+    @property
+    def noun(self) -> str:
+        """What the objects are called: vehicles, unless people are among them."""
+        return "object" if {one.kind for one in self.tracks} & {*PEOPLE} else "vehicle"
 
-TEXT_COLUMNS = ("car",)
+
+TEXT_COLUMNS = ("object",)
 NOTES = (
-    "lost: frames in which the detector misses the car, out of those in which it counts; before: in the original "
+    "lost: frames in which the detector misses the object, out of those in which it counts; before: in the original "
     "clip, after: with the change, random: with a random change of the same size.",
     "longest: longest unbroken run of missed frames after the change. unseen: metres by which the camera approaches "
-    "the car while it is missed, out of the metres while it counts.",
+    "the object while it is missed, out of the metres while it counts.",
     "certain: graded frames with a new miss in which the miss is certain (docs/guide/ideas.md).",
 )
 _TABLE_STYLE: dict[str, Any] = {
@@ -219,54 +225,69 @@ _TABLE_STYLE: dict[str, Any] = {
 def build_report(result: DriveResult) -> AnalysisReport:
     """Build the report in the result's folder."""
     title = f"{result.detector} on {result.clip}: {' + '.join(result.params)}, {result.method}"
-    rows = [format_car(car) for car in result.cars]
+    rows = [format_track(one) for one in result.tracks]
     table = ReportTable(title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), _TABLE_STYLE)
     return AnalysisReport(
         out=Path(result.out),
         name="drive",
         heading=f"{format_count(result.frames, 'frame')} of {result.clip}",
         data=asdict(result),
-        csv_tables={"drive": [car_metrics(car) for car in result.cars]},
+        csv_tables={"drive": [track_metrics(one) for one in result.tracks]},
         tables=[table],
-        notes=[*NOTES, format_summary(result), *list_infeasible(result)],
+        notes=[*NOTES, format_summary(result), *list_classes(result), *list_infeasible(result)],
         text_columns=TEXT_COLUMNS,
         failed={f"frame {name}": reason for name, reason in result.failed.items()},
     )
 
 
-def format_car(car: CarResult) -> dict[str, str]:
-    """Format a car's row of the table."""
+def format_track(one: TrackResult) -> dict[str, str]:
+    """Format an object's row of the table."""
     return {
-        "car": f"{car.track} {car.kind}",
-        "lost before": f"{car.lost_before}",
-        "lost after": f"{car.lost_after}",
-        "lost random": f"{car.lost_control}",
-        "of": f"{car.frames}",
-        "longest": f"{car.longest_after}",
-        "unseen before": f"{car.metres_lost_before:.1f}",
-        "unseen after": f"{car.metres_lost_after:.1f}",
-        "unseen random": f"{car.metres_lost_control:.1f}",
-        "of m": f"{car.metres:.1f}",
-        "certain": f"{car.certain}/{car.graded}" if car.graded else "-",
+        "object": f"{one.track} {one.kind}",
+        "lost before": f"{one.lost_before}",
+        "lost after": f"{one.lost_after}",
+        "lost random": f"{one.lost_control}",
+        "of": f"{one.frames}",
+        "longest": f"{one.longest_after}",
+        "unseen before": f"{one.metres_lost_before:.1f}",
+        "unseen after": f"{one.metres_lost_after:.1f}",
+        "unseen random": f"{one.metres_lost_control:.1f}",
+        "of m": f"{one.metres:.1f}",
+        "certain": f"{one.certain}/{one.graded}" if one.graded else "-",
     }
 
 
 def format_summary(result: DriveResult) -> str:
     """Summarise the clip on one line."""
-    before, after, control = (
-        sum(getattr(car, f"lost_{state}") for car in result.cars) for state in ("before", "after", "control")
-    )
-    sightings = format_count(sum(car.frames for car in result.cars), "sighting")
     phantoms, frames = format_count(result.phantoms["after"], "phantom"), format_count(result.frames, "frame")
     queries, passes = (
         format_count(result.queries, "query", "queries"),
         format_count(result.passes, "pass", "passes"),
     )
     return (
-        f"{after} of {sightings} of {format_count(len(result.cars), 'car')} missed ({before} before, {control} by a "
-        f"random change), {phantoms} ({result.phantoms['control']} random); "
+        f"{_format_misses(result.tracks, result.noun)}, {phantoms} ({result.phantoms['control']} random); "
         f"feasible in {result.feasible} of {frames}; {queries}, {passes}, {result.seconds:.0f} s"
     )
+
+
+def list_classes(result: DriveResult) -> list[str]:
+    """List the misses by class, where people and vehicles both count."""
+    kinds = dict.fromkeys(one.kind for one in result.tracks if one.frames)
+    if len({kind in PEOPLE for kind in kinds}) < 2:
+        return []
+    return [
+        f"{kind}: {_format_misses([one for one in result.tracks if one.kind == kind], result.noun)}"
+        for kind in kinds
+    ]
+
+
+def _format_misses(tracks: Sequence[TrackResult], noun: str) -> str:
+    before, after, control = (
+        sum(getattr(one, f"lost_{state}") for one in tracks) for state in ("before", "after", "control")
+    )
+    sightings = format_count(sum(one.frames for one in tracks), "sighting")
+    counted = format_count(sum(one.frames > 0 for one in tracks), noun)
+    return f"{after} of {sightings} of {counted} missed ({before} before, {control} by a random change)"
 
 
 def list_infeasible(result: DriveResult) -> list[str]:
@@ -274,9 +295,9 @@ def list_infeasible(result: DriveResult) -> list[str]:
     return [f"infeasible in frame {name}: {'; '.join(lines)}" for name, lines in result.violations.items()]
 
 
-def car_metrics(car: CarResult) -> dict[str, Any]:
-    """A car's numbers by name, without its data per frame."""
-    return {name: value for name, value in asdict(car).items() if name not in ("states", "distance_m", "path_m")}
+def track_metrics(one: TrackResult) -> dict[str, Any]:
+    """An object's numbers by name, without its data per frame."""
+    return {name: value for name, value in asdict(one).items() if name not in ("states", "distance_m", "path_m")}
 
 
 _CLASSES = {FOUND: "f", LOST: "l", UNCOUNTED: "u"}
@@ -288,7 +309,7 @@ def write_page(path: Path, result: DriveResult) -> None:
         {"name": name} | {side: quote(f"{FRAMES}/{name}/{side}.jpg") for side in ("before", "after")}
         for name in result.names
     ]
-    rows = [format_car(car) for car in result.cars]
+    rows = [format_track(one) for one in result.tracks]
     text = web.render_page(
         "drivesem.video:page.html",
         "drivesem.video:page.js",
@@ -301,14 +322,14 @@ def write_page(path: Path, result: DriveResult) -> None:
         pictures=pictures,
         columns=list(rows[0]),
         rows=[list(row.values()) for row in rows],
-        notes=(*NOTES, format_summary(result), *list_infeasible(result)),
+        notes=(*NOTES, format_summary(result), *list_classes(result), *list_infeasible(result)),
         result=result,
     )
     files.write_text(path, text)
 
 
 def _runs(states: str) -> Iterator[tuple[int, int, str]]:
-    """Yield runs of frames in one state: start, length and CSS class, without frames that lack the car."""
+    """Yield runs of frames in one state: start, length and CSS class, without frames that lack the object."""
     start = 0
     for state, group in groupby(states):
         length = len(list(group))
@@ -318,46 +339,48 @@ def _runs(states: str) -> Iterator[tuple[int, int, str]]:
 
 
 def _headline(result: DriveResult) -> str:
-    worst = result.cars[0]
+    worst = result.tracks[0]
     if worst.new_misses <= 0:
-        return f"{result.detector} misses no car of {result.clip} in more frames than before"
+        return f"{result.detector} misses no {result.noun} of {result.clip} in more frames than before"
     return (
-        f"{result.detector} misses car {worst.track} in {worst.lost_after} of {format_count(worst.frames, 'frame')}, "
-        f"{worst.lost_before} before"
+        f"{result.detector} misses {worst.kind.lower()} {worst.track} in {worst.lost_after} of "
+        f"{format_count(worst.frames, 'frame')}, {worst.lost_before} before"
     )
 
 
 def _lead(result: DriveResult) -> str:
     return (
         f"{' + '.join(result.params)} changed by {result.method}: one change for each of "
-        f"{format_count(len(result.cars), 'car')} over {format_count(result.frames, 'frame')}, compared with a random "
-        "change of the same size."
+        f"{format_count(len(result.tracks), result.noun)} over {format_count(result.frames, 'frame')}, compared with a "
+        "random change of the same size."
     )
 
 
 def _tiles(result: DriveResult) -> list[dict[str, str]]:
-    cars = result.cars
+    tracks = result.tracks
     lost, before, control, counted = (
-        sum(getattr(car, name) for car in cars) for name in ("lost_after", "lost_before", "lost_control", "frames")
+        sum(getattr(one, name) for one in tracks)
+        for name in ("lost_after", "lost_before", "lost_control", "frames")
     )
-    unseen = max(cars, key=lambda car: car.metres_lost_after)
-    longest = max(cars, key=lambda car: car.longest_after)
-    graded, certain = sum(car.graded for car in cars), sum(car.certain for car in cars)
+    unseen = max(tracks, key=lambda one: one.metres_lost_after)
+    longest = max(tracks, key=lambda one: one.longest_after)
+    graded, certain = sum(one.graded for one in tracks), sum(one.certain for one in tracks)
     return [
         {
-            "title": "missed cars, over all frames",
+            "title": f"missed {result.noun}s, over all frames",
             "figure": f"{before} → {lost}",
             "more": f"of {counted}; random change: {control}",
         },
         {
             "title": "longest time missed",
             "figure": f"{longest.longest_after / 10:.1f} s",
-            "more": f"car {longest.track}; {longest.longest_before / 10:.1f} s before",
+            "more": f"{longest.kind.lower()} {longest.track}; {longest.longest_before / 10:.1f} s before",
         },
         {
             "title": "longest approach while missed",
             "figure": f"{unseen.metres_lost_after:.1f} m",
-            "more": f"car {unseen.track}, of {unseen.metres:.1f} m; {unseen.metres_lost_before:.1f} m before",
+            "more": f"{unseen.kind.lower()} {unseen.track}, of {unseen.metres:.1f} m; "
+            f"{unseen.metres_lost_before:.1f} m before",
         },
         {
             "title": "certain new misses",

@@ -1,4 +1,4 @@
-"""`drivesem drive`: de-renders a clip, changes each car consistently over its track, and reports new misses."""
+"""`drivesem drive`: de-renders a clip, changes each object consistently over its track, and reports new misses."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from drivesem.video.report import (
     LOST,
     STATES,
     UNCOUNTED,
-    CarResult,
     DriveResult,
     State,
+    TrackResult,
     build_report,
     write_page,
     write_video,
@@ -64,7 +64,15 @@ def attack_clip(config: DriveConfig) -> AnalysisReport:
     check_device(config.device)
     worker = attacks.AttackWorker.from_config(attack_config)
     out = Path(config.out) if config.out else Path("runs") / _name(config, [str(p) for p in params])
-    source = ClipSource(config.clip, config.sequence, config.limit, config.seed, config.fit, config.keep_going)
+    source = ClipSource(
+        folder=config.clip,
+        name=config.sequence,
+        limit=config.limit,
+        seed=config.seed,
+        fit=config.fit,
+        keep_going=config.keep_going,
+        people=config.moves_people,
+    )
     derenderer = ClipDerenderer(source, out / SCENES)
     claim_folder(out, config, _WRITTEN, _FREE)
     if config.resume and (out / RESULT).is_file():
@@ -77,7 +85,7 @@ def attack_clip(config: DriveConfig) -> AnalysisReport:
     recorder, control = _ClipRecorder(clip, objective, out), theta0
     with progress_bar(Console(stderr=True)) as progress:
         task = progress.add_task(
-            f"evaluating {format_count(len(clip.names), 'frame')} with {format_count(objective.space.count, 'car')}",
+            f"evaluating {format_count(len(clip.names), 'frame')} with {format_count(objective.space.count, 'object')}",
             total=None,
         )
         objective.on_frame = lambda: progress.advance(task)
@@ -95,7 +103,7 @@ def attack_clip(config: DriveConfig) -> AnalysisReport:
         method=config.method,
         frames=len(clip.names),
         names=clip.names,
-        cars=recorder.cars(),
+        tracks=recorder.tracks(),
         phantoms=recorder.phantoms,
         feasible=len(clip.names) - len(recorder.violations),
         violations=recorder.violations,
@@ -188,8 +196,8 @@ class _ClipRecorder:
         for frame in _choose_frames(new_misses, certify):
             self._grade(frame, theta, worker)
 
-    def cars(self) -> tuple[CarResult, ...]:
-        """Result of each car, by descending number of new misses."""
+    def tracks(self) -> tuple[TrackResult, ...]:
+        """Result of each object, by descending number of new misses."""
         found = []
         for track in self.objective.space.tracks:
             rows = [(f, t.index(track)) for f, t in enumerate(self.clip.tracks) if track in t]
@@ -203,9 +211,9 @@ class _ClipRecorder:
             kind = CLASSES[int(self.clip.scenes[frame].objects.category[row])]
             paths = tuple(path.get(f) for f in range(len(away)))
             found.append(
-                CarResult.from_states(track, kind, states, tuple(away), paths, self._grades.get(track, []))
+                TrackResult.from_states(track, kind, states, tuple(away), paths, self._grades.get(track, []))
             )
-        return tuple(sorted(found, key=lambda car: (-car.new_misses, car.track)))
+        return tuple(sorted(found, key=lambda one: (-one.new_misses, one.track)))
 
     def _grade(self, frame: int, theta: Tensor, worker: attacks.AttackWorker) -> None:
         """Grade the new misses in a frame."""
@@ -240,7 +248,7 @@ class _ClipRecorder:
 
 
 def _choose_frames(new_misses: Mapping[int, Sequence[int]], most: int) -> list[int]:
-    """Choose at most `most` frames with new misses, spread over cars."""
+    """Choose at most `most` frames with new misses, spread over objects."""
     share = math.ceil(most / max(len(new_misses), 1))
     return _choose_evenly(
         sorted({frame for frames in new_misses.values() for frame in _choose_evenly(frames, share)}), most

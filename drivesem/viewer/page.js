@@ -5,9 +5,9 @@
 const $ = id => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 const PAGE = Math.random().toString(36).slice(2);
-const GROUPS = {translate: "Place", rotate: "Place", size: "Size and shape", shape: "Size and shape", color: "Paint",
+const GROUPS = {translate: "Place", rotate: "Place", size: "Size and shape", shape: "Size and shape", color: "Colour",
   weather: "Weather", foliage: "Leaves", sun: "Sun", lamps: "Lamps"};
-const ORDER = ["Place", "Paint", "Size and shape", "Lamps", "Weather", "Leaves", "Sun"];
+const ORDER = ["Place", "Colour", "Size and shape", "Lamps", "Weather", "Leaves", "Sun"];
 const MEANING = {along: "forwards, along its photographed heading", across: "to its own left", yaw: "about its ground centre",
   a: "from green to red", b: "from blue to yellow", shape: "share of the shape that was found"};
 const STATUS = {found: "found", lost: "lost", missed: "missed as photographed too", ignored: "not judged"};

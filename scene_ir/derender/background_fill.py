@@ -33,8 +33,10 @@ _MIN_REST = 0.05
 """A smaller share of all but vehicles carries no information."""
 _SEAM = 0.06
 """Width of the border along which a person's fill takes the colours around it, in heights."""
-_NEAR_THIN = 1.5
-"""Range around a person from which patches are copied, in heights."""
+_NEAR_THIN = (1.0, 0.5)
+"""Range around a person from which parts are copied, across and down, in heights."""
+_MAX_THIN_PX = 100
+"""Height up to which a person's fill is searched at full size; the time grows with its area squared."""
 _BORDER_PX = 5
 """Pixels this near to vehicles and shadows are not copied: their colours are mixed, and masks have errors."""
 
@@ -144,26 +146,30 @@ class BackgroundFill:
         filled = self._fill_hole(_scale_mask(hole, self._work.shrink), seed)
         return filled if self._work is self._full else self._full.enlarge(filled, hole)
 
-    def fill_thin(self, filled: Array, thin: Mask, hole: Mask, seed: int) -> Array:
-        """The image (H, W, 3) with what stood before it filled by patches of what is near, as suits objects that
-        are narrower than what they hide.
+    def fill_thin(self, filled: Array, thin: Mask) -> Array:
+        """The image (H, W, 3) with what stood before it filled by shifted parts of what is near (He and Sun 2012), as
+        suits objects that are narrower than what they hide.
 
         Args:
             filled: The image, filled otherwise.
             thin: Pixels (H, W) of one person.
-            hole: All filled pixels (H, W), not copied.
-            seed: Of the random search.
         """
         x0, y0, x1, y1 = mask_bounds(thin)
-        reach = round(_NEAR_THIN * (y1 - y0))
-        window = (slice(max(y0 - reach, 0), y1 + reach), slice(max(x0 - reach, 0), x1 + reach))
-        inputs = self._full.inputs
-        forbidden = _excluded_pixels(self._full, hole)[window] | (grow_mask(hole, 1) & ~thin)[window]
-        ground = patch_fill.GroundMaps(np.zeros_like(thin[window]), inputs.maps.ground[window].astype(np.float32))
+        across, down = (round(reach * (y1 - y0)) for reach in _NEAR_THIN)
+        window = (slice(max(y0 - down, 0), y1 + down), slice(max(x0 - across, 0), x1 + across))
+        inputs, hole = self._full.inputs, thin[window]
+        unknown = hole | (inputs.maps.person[window] > _PERSON_SHARE)
+        height, width = hole.shape
+        scale = min(1.0, _MAX_THIN_PX / (y1 - y0))
+        size = (max(round(scale * width), 1), max(round(scale * height), 1))
+        small = cv2.resize(filled[window], size, interpolation=cv2.INTER_AREA)
+        lab = cv2.cvtColor(np.rint(small * 255).astype(np.uint8), cv2.COLOR_RGB2Lab)
+        known = cv2.resize(unknown.astype(np.float32), size, interpolation=cv2.INTER_AREA) == 0
+        cv2.xphoto.inpaint(lab, known.astype(np.uint8) * 255, moved := lab.copy(), cv2.xphoto.INPAINT_SHIFTMAP)
+        moved = cv2.cvtColor(moved, cv2.COLOR_Lab2RGB).astype(np.float32) / 255
         image = filled.copy()
-        horizon = inputs.horizon - window[0].start
-        patched = patch_fill.fill_patches(filled[window], thin[window], forbidden, horizon, ground, seed)
-        image[window] = _hide_seam(patched, thin[window], _SEAM * (y1 - y0))
+        full = np.clip(cv2.resize(moved, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
+        image[window] = _hide_seam(np.where(hole[..., None], full, filled[window]), hole, _SEAM * (y1 - y0))
         return image
 
     def _fill_hole(self, hole: Mask, seed: int) -> Array:

@@ -211,7 +211,9 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         provenance[f"objects[{index}].mask_iou"] = f"{cut.agreement:.3f}"
     provenance |= {f"labels[{row}].background": reason for row, reason in left_out.items()}
     # People, trams and vehicles that were not cut out stay in the background, and no detection counts there.
+    _, ridden = people.join_riders(labels)
     object_rows = {cut.row for cut in cuts}
+    object_rows |= {ridden[row] for row in object_rows & ridden.keys()}
     other_labels = labels.select([row for row in range(len(labels.kind)) if row not in object_rows])
     if ego_mask is not None:
         regions = torch.cat([other_labels.ignore_xyxy, ego.ignored_regions(ego_mask).to(other_labels.ignore_xyxy)])
@@ -703,7 +705,7 @@ def _separate_layers(
     filled = fill.fill_hole(hole, settings.seed)
     mattes = [cutout_opacity(cut.cutout, cut.mask, cut.hidden) for cut in cuts]
     for i, reach in reaches:
-        filled = fill.fill_thin(filled, grow_mask(reach, 2), hole, settings.seed)
+        filled = fill.fill_thin(filled, grow_mask(reach, 2))
         mattes[i] = np.maximum(mattes[i], _TRACE_OPACITY * reach).astype(np.float32)
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)

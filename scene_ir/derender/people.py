@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +22,9 @@ Mask = NDArray[np.bool_]
 
 PEOPLE_CATEGORIES = {"Pedestrian": Category.PEDESTRIAN, "Cyclist": Category.CYCLIST}
 """Label types that may become upright objects."""
+_TWO_WHEELERS = ("Bicycle", "Motorcycle")
+_MIN_RIDDEN = 0.3
+"""Least share of the smaller box that a rider and the two-wheeler have in common."""
 WEIGHTS = Path(__file__).parent / "weights" / "people.safetensors"
 """The shipped weights, made by `tools/train_cutout.py --people`."""
 
@@ -67,6 +70,35 @@ class PersonCutout:
     """Shares of pixels."""
 
 
+def join_riders(labels: Labels) -> tuple[torch.Tensor, dict[int, int]]:
+    """Find the two-wheelers of cyclists, in data sets that label rider and two-wheeler apart.
+
+    Args:
+        labels: Labels of N objects.
+
+    Returns:
+        Boxes (N, 4) px, a cyclist's around both; and the two-wheeler's row by the rider's.
+    """
+    boxes = labels.boxes_xyxy.tolist()
+    areas = [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in boxes]
+    riders = [i for i, kind in enumerate(labels.kind) if kind == "Cyclist"]
+    others = [i for i, kind in enumerate(labels.kind) if kind in _TWO_WHEELERS]
+    pairs = [
+        (_shared_area(boxes[rider], boxes[other]) / max(min(areas[rider], areas[other]), 1.0), rider, other)
+        for rider in riders
+        for other in others
+    ]
+    ridden: dict[int, int] = {}
+    for share, rider, other in sorted(pairs, reverse=True):
+        if share >= _MIN_RIDDEN and rider not in ridden and other not in ridden.values():
+            ridden[rider] = other
+    whole = labels.boxes_xyxy.clone()
+    for rider, other in ridden.items():
+        (x0, y0, x1, y1), (left, top, right, bottom) = boxes[rider], boxes[other]
+        whole[rider] = whole.new_tensor([min(x0, left), min(y0, top), max(x1, right), max(y1, bottom)])
+    return whole, ridden
+
+
 def cut_out_people(
     picture: NDArray[np.uint8], frame: Frame, rows: Sequence[int], ground: torch.Tensor, backend: verbs.Backend
 ) -> tuple[list[PersonCutout], dict[int, str]]:
@@ -83,13 +115,15 @@ def cut_out_people(
         The people that are wholly visible and have a clean outline, nearest first, with disjoint masks; and for each
         other row of a person the reason why it stays in the background.
     """
-    labels, camera = frame.labels, frame.camera
-    assert labels is not None
+    assert frame.labels is not None
+    whole, ridden = join_riders(frame.labels)
+    labels, camera = replace(frame.labels, boxes_xyxy=whole), frame.camera
+    frame = replace(frame, labels=labels)
     posed = set(rows)
     reasons: dict[int, str] = {}
     for row, kind in enumerate(labels.kind):
         if kind in PEOPLE_CATEGORIES or kind == "Person_sitting":
-            reason = _find_obstacle(labels, row, frame) if row in posed else "no 3D box"
+            reason = _find_obstacle(labels, row, frame, ridden) if row in posed else "no 3D box"
             reasons[row] = reason
     chosen = [row for row, reason in reasons.items() if not reason]
     depths = to_clip(labels.translation, camera.matrix.to(labels.translation))[:, 2].tolist()
@@ -97,7 +131,8 @@ def cut_out_people(
     cuts: list[PersonCutout] = []
     taken = np.zeros(picture.shape[:2], bool)
     for row in chosen:
-        shares = _inside_box(_segment(picture, frame, row, taken, ground, backend), labels, row)
+        parts = [ridden[row]] if row in ridden else []
+        shares = _inside_box(_segment(picture, frame, row, parts, taken, ground, backend), labels, row)
         share = shares.full_map("visible", taken.shape)
         mask = _remove_specks((share >= _SOLID) & ~taken)
         reasons[row] = _find_flaw(mask, shares, labels.boxes_xyxy[row].tolist())
@@ -116,27 +151,32 @@ def _segment(
     picture: NDArray[np.uint8],
     frame: Frame,
     row: int,
+    parts: list[int],
     taken: Mask,
     ground: torch.Tensor,
     backend: verbs.Backend,
 ) -> Cutout:
-    """The cut-out of a label by the data set's mask if there is one, else by the network in its 2D box."""
+    """The cut-out of a label by the data set's masks, of its row and of its parts', if there are any, else by the
+    network in its 2D box.
+    """
     labels = frame.labels
     assert labels is not None
     network = cutout.load_network(WEIGHTS)
     if frame.masks is not None:
-        mask = (frame.masks[row] > 0.5).numpy() & ~taken
+        mask = (frame.masks[[row, *parts]] > 0.5).any(0).numpy() & ~taken
         empty = Cutout(0, 0, *(np.zeros((0, 0), np.float32),) * 3)
         return cutout.cutout_from_mask(picture, mask, taken, network) if mask.any() else empty
     guide = upright.place_box(labels.boxes_xyxy[row], labels.translation[row], frame.camera)
     return cutout.cut_out(picture, [guide], [taken], ground, frame.camera, backend, network=network)[0]
 
 
-def _find_obstacle(labels: Labels, row: int, frame: Frame) -> str:
+def _find_obstacle(labels: Labels, row: int, frame: Frame, ridden: Mapping[int, int]) -> str:
     """Why a label cannot be cut out whole, by the labels alone; empty if nothing is against it."""
     x0, y0, x1, y1 = box = labels.boxes_xyxy[row].tolist()
     if labels.kind[row] == "Person_sitting":
         return "sitting"
+    if frame.provenance.get(f"labels[{row}].name") == "rider" and row not in ridden:
+        return "no two-wheeler"
     if y1 - y0 < _MIN_HEIGHT_PX:
         return f"lower than {_MIN_HEIGHT_PX:.0f} px"
     right, bottom = frame.camera.width - 1 - _BORDER_PX, frame.camera.height - 1 - _BORDER_PX
@@ -144,7 +184,7 @@ def _find_obstacle(labels: Labels, row: int, frame: Frame) -> str:
         return "cut by the border"
     if 0 < int(labels.occlusion[row]) < _UNKNOWN_OCCLUSION:
         return "partly hidden"
-    others = [other for i, other in enumerate(labels.boxes_xyxy.tolist()) if i != row]
+    others = [other for i, other in enumerate(labels.boxes_xyxy.tolist()) if i not in (row, ridden.get(row))]
     covered = [_shared_area(box, other) for other in others if other[3] > y1 - 0.05 * (y1 - y0)]
     people = [_shared_area(box, region) for region in labels.ignore_xyxy.tolist()]
     if max([*covered, *people], default=0.0) > _MAX_COVERED * (x1 - x0) * (y1 - y0):

@@ -166,11 +166,14 @@ def test_python_runs(page: Path, workplace: Path) -> None:
             exec(compile(padded, str(page), "exec"), names)
 
 
-def test_the_readmes_caption_is_that_of_its_picture() -> None:
+@pytest.mark.parametrize(
+    ("page", "picture"), [("README.md", "docs/example.jpg"), ("docs/guide/attack.md", "docs/crossing.jpg")]
+)
+def test_a_caption_is_that_of_its_picture(page: str, picture: str) -> None:
     """`tools/example_picture.py` writes the caption into the picture."""
-    with Image.open(ROOT / "docs" / "example.jpg") as picture:
-        caption = picture.info["comment"].decode()
-    assert caption in " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    with Image.open(ROOT / picture) as image:
+        caption = image.info["comment"].decode()
+    assert caption in " ".join((ROOT / page).read_text(encoding="utf-8").split())
 
 
 GATE_PAGE = ROOT / "docs" / "guide" / "gate.md"

@@ -225,7 +225,7 @@ def test_margins_of_several_points_are_found_together(tmp_path: Path, monkeypatc
 def test_a_clip(tmp_path: Path) -> None:
     here, there = on_both(["drive", "--limit", "3", "--steps", "2"], tmp_path)
     first, second = (json.loads((out / "drive.json").read_text()) for out in (here, there))
-    assert first["cars"] == second["cars"]
+    assert first["tracks"] == second["tracks"]
     np.testing.assert_allclose(second["loss_trace"], first["loss_trace"], rtol=1e-3)
 
 

@@ -1,5 +1,7 @@
 """Vehicles that leave, park, or replace others: proposals, labels, refusals."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,6 +9,7 @@ import torch
 import trimesh
 
 import drivesem as ds
+from drivesem.attacks import changes
 from drivesem.attacks.budgets import PRESETS
 from drivesem.attacks.changes import (
     VehicleChange,
@@ -30,6 +33,7 @@ from scene_ir.meshes.load import save_mesh
 from scene_ir.meshes.templates import make_roof_load, template
 from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import Compositor
+from scene_ir.render.sources import photograph_scene
 from scene_ir.types import Category, SceneIR
 
 SIZE = torch.tensor([4.0, 1.5, 1.75])
@@ -252,3 +256,20 @@ def test_a_z_up_mesh_is_upright_and_as_the_generator_has_it(scene: SceneIR, tmp_
     assert roof[:, 0].unique().tolist() == pytest.approx([-1.2 / 4.2, 0.8 / 4.2])
     made = propose_scenes(scene, VehicleChangeSettings((VehicleChange.PARK,), own), 1, 0)
     assert made[0].objects.size_lhw[-1].tolist() == pytest.approx([4.2, 1.4, 1.8])
+
+
+def test_a_person_who_emerges_is_half_hidden(
+    street: Callable[..., SceneIR], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Feasible places where the car hides nobody, or all of the legs and chest, are passed over."""
+    scene = street([(-4.0, 11.0), (0.0, 10.0)], yaw=0.0)
+    person = {
+        "category": torch.tensor([int(Category.PEDESTRIAN), int(Category.CAR)]),
+        "size_lhw": torch.tensor([[0.8, 1.75, 0.6], [4.2, 1.5, 1.75]]),
+    }
+    scene = photograph_scene(replace(scene, objects=replace(scene.objects, **person)))
+    places = (torch.tensor([x, 1.65, 12.0]) for x in (3.5, 0.0, 2.3))
+    monkeypatch.setattr(changes, "_choose_place_behind", lambda *_: next(places))
+    (made,) = propose_scenes(scene, VehicleChangeSettings((VehicleChange.EMERGE,)), 1, 0)
+    assert made.objects.translation[0].tolist() == pytest.approx([2.3, 1.65, 12.0])
+    assert made.objects.occlusion.tolist() == [1, 0]

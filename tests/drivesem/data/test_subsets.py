@@ -174,6 +174,15 @@ def test_own_splits_and_class_names(tmp_path: Path) -> None:
         open_selection("kitti", root, FrameFilter("train"))
 
 
+def test_riders_labelled_apart_from_their_two_wheelers_are_marked(tmp_path: Path) -> None:
+    root = _kitti(tmp_path, ["000000"], 10)
+    for mapping, expected in (({"Car": "Rider"}, "rider"), ({"Car": "Cyclist"}, None)):
+        frame = open_selection("kitti", root, FrameFilter(mapping=mapping)).frame("000000")
+        assert frame.labels is not None
+        assert frame.labels.kind == ("Cyclist",)
+        assert frame.provenance.get("labels[0].name") == expected
+
+
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     first = _kitti(tmp_path / "a", ["000000"], 10)
     with pytest.raises(FormatError, match="missing"):

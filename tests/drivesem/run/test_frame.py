@@ -16,9 +16,11 @@ from detectors.incremental.reference import LIMIT_MB, ReferencePass
 from detectors.registry import load_detector
 from drivesem.attacks.methods.learned import Learn, MarginModel
 from drivesem.config.commands import AttackConfig
+from drivesem.evaluation.resampling import ClusteredShare
 from drivesem.failures.feature_cells import CellVisit
 from drivesem.run.attack import AttackWorker
 from drivesem.run.frame import estimate_rate, write_frame
+from drivesem.run.results import RunSummary
 from drivesem.run.search_memory import MARGINS, read_margin_rows
 from drivesem.scenes.sources import NoVehicleError
 from drivesem.synth.demo import demo_scene
@@ -94,6 +96,12 @@ def test_a_rate_leaves_out_searched_states_and_objects_missed_before() -> None:
     rate = estimate_rate(frames)
     assert rate is not None
     assert (rate.failing, rate.draws, rate.frames) == (4, 24, 2)
+
+
+def test_a_rate_is_printed_without_exponents() -> None:
+    summary: Any = SimpleNamespace(rate=ClusteredShare(10, 31, 2, 10 / 31, 2.4e-59, 1.0), noun="object")
+    text = RunSummary.describe_rate(summary)
+    assert text == "rate: 10 of 31 objects in random states of 2 frames missed (32.3 % [0, 100])"
 
 
 @pytest.mark.parametrize(

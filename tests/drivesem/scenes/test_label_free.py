@@ -305,6 +305,22 @@ def test_labelled_boxes_are_placed_and_stay() -> None:
     assert estimate_label_poses(frame).provenance["places"] == "estimated"
 
 
+def test_a_rider_stands_where_the_wheels_do() -> None:
+    car, rider, bicycle, cyclist = (
+        [600.0, 180.0, 700.0, 240.0],
+        [50.0, 150.0, 90.0, 240.0],
+        [45.0, 200.0, 95.0, 260.0],
+        [45.0, 150.0, 95.0, 260.0],
+    )
+    apart = boxed(frame_of(), ("car", "rider", "bicycle"), [car, rider, bicycle])
+    together = boxed(frame_of(), ("car", "cyclist"), [car, cyclist])
+    one, other = (estimate_label_poses(frame).labels for frame in (apart, together))
+    assert one is not None
+    assert other is not None
+    assert one.boxes_xyxy[1].tolist() == rider
+    assert torch.equal(one.translation[1], other.translation[1])
+
+
 def test_known_labels_are_not_estimated() -> None:
     expected = {"truncation": torch.tensor([0.4]), "occlusion": torch.tensor([1])}
     labels = estimate_label_poses(boxed(frame_of(), ("Car",), [[600.0, 180.0, 700.0, 240.0]], **expected)).labels

@@ -11,7 +11,7 @@ from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.space import Budget, Parameter, ParameterSpace
 from drivesem.video.clips import DerenderedClip
 from drivesem.video.objective import ClipSpace, project_clip
-from drivesem.video.report import CarResult, MissedInterval
+from drivesem.video.report import MissedInterval, TrackResult
 from scene_ir.types import SceneIR
 from tests.drivesem.video.clips import clip_of
 
@@ -72,6 +72,22 @@ def test_a_path_is_a_cubic_within_its_bounds(streets: DerenderedClip) -> None:
     assert all(torch.equal(still.frame_theta(theta, f), still.frame_theta(theta, 0)) for f in range(9))
 
 
+@pytest.mark.parametrize("bend", [0, 3])
+def test_a_persons_path_ends_at_the_labelled_place_before_frames_without_the_person(
+    streets: DerenderedClip, bend: int
+) -> None:
+    """In frames 12 and 13 the person of track 7 is background: its offset shrinks in the second before."""
+    spaces = [ParameterSpace(streets.scenes[0], ("translate",))] * 12
+    tracks = [streets.tracks[0]] * 12
+    background = [frozenset[int]()] * 12 + [frozenset({7})] * 2
+    free, space = ClipSpace(spaces, tracks, bend), ClipSpace(spaces, tracks, bend, background)
+    theta = random_theta(space)
+    for frame in range(12):
+        offset, whole = (one.path_offsets(theta, frame) for one in (space, free))
+        assert torch.equal(offset[[0, 2]], whole[[0, 2]])
+        assert torch.allclose(offset[1], min((12 - frame) / 10, 1.0) * whole[1])
+
+
 def test_bounds_are_the_tightest_of_a_cars_frames(streets: DerenderedClip) -> None:
     budget = Budget(translate_m=4.0, translate=1.5, distance_share=0.05)
     spaces = [ParameterSpace(scene, ("translate",), budget) for scene in streets.scenes]
@@ -99,10 +115,10 @@ def test_gradients_go_back_to_the_clip(space: ClipSpace) -> None:
 
 def test_names_units_and_values_are_a_cars(space: ClipSpace) -> None:
     message = space.theta_by_name(random_theta(space))
-    first = "cars[4].translate.along[0]"
+    first = "tracks[4].translate.along[0]"
     assert first in message
     assert str(message[first]["display"]).endswith(" m")
-    assert message["cars[9].yaw"]["unit"] == "rad"
+    assert message["tracks[9].yaw"]["unit"] == "rad"
     assert "weather.fog" in message
 
 
@@ -131,7 +147,7 @@ def test_cars_that_cannot_move_stay(space: ClipSpace) -> None:
     sets = [FeasibleSet(one) for one in space.spaces]
     found = project_clip(space, [Nothing(), *sets[1:]], random_theta(space, 0.5))  # pyright: ignore[reportArgumentType]
     assert not space.frame_theta(found.theta, 0).any()
-    assert f"cars[{space.tracks[int(space.rows[0][0])]}]: road" in found.active
+    assert f"tracks[{space.tracks[int(space.rows[0][0])]}]: road" in found.active
 
 
 def test_misses_are_counted_by_stretch_and_metre() -> None:
@@ -140,7 +156,7 @@ def test_misses_are_counted_by_stretch_and_metre() -> None:
     assert missed == MissedInterval(frames=6, lost=4, longest=3, metres=7.0, metres_lost=6.0)
     nothing = MissedInterval.from_states("--  ", (9.0, 8.0, None, None))
     assert nothing == MissedInterval(0, 0, 0, 0.0, 0.0)
-    car = CarResult.from_states(
+    car = TrackResult.from_states(
         4, "Car", {"before": "ff", "after": "fl", "control": "ll"}, (9.0, 7.5), (None, None), [True]
     )
     assert (car.frames, car.lost_before, car.lost_after, car.lost_control, car.new_misses) == (2, 0, 1, 2, 1)

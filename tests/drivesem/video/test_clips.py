@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import torch
 
 from drivesem.data.subsets import Clip
 from drivesem.video import clips as taking
-from drivesem.video.clips import ClipDerenderer, ClipSource
+from drivesem.video.clips import ClipDerenderer, ClipSource, background_people, object_tracks
 from scene_ir.derender.derender import DerenderSettings
 from scene_ir.derender.silhouette import Placement, place_mesh
 from scene_ir.errors import FormatError
@@ -108,6 +109,30 @@ def test_without_keep_going_no_frame_is_taken_apart_with_another_shape(
         with pytest.raises(FormatError, match=r"b\.png"):
             damaged.frames.scene(name)
     assert not meshes
+
+
+@pytest.mark.parametrize("people", [False, True])
+def test_people_become_objects_where_they_are_chosen(
+    people: bool,
+    taker: Callable[..., tuple[ClipDerenderer, dict[str, list[str]]]],
+    street: Callable[..., SceneIR],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """The first label is cut out, and the second one's person stays in the background."""
+
+    def derender(_: Frame, settings: DerenderSettings) -> SceneIR:
+        assert settings.people == people
+        return replace(
+            street([(-2.0, 15.0)]), provenance={"objects[0].label": "0", "labels[1].background": "sitting"}
+        )
+
+    taker(keep_going=False)
+    monkeypatch.setattr(taking, "derender", derender)
+    source = ClipSource("folder", None, None, 0, False, False, people)
+    scene = ClipDerenderer(source, tmp_path).frames.scene("a")
+    assert object_tracks(scene) == (4,)
+    assert background_people(scene) == {7}
 
 
 def test_a_damaged_first_image_leaves_a_camera(

@@ -8,22 +8,29 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import pytest
+import torch
 
+from detectors.registry import load_predictor
+from drivesem.attacks.space import Budget, Parameter
 from drivesem.cli import main
+from drivesem.config.commands import DriveConfig
+from drivesem.config.errors import UsageError
 from drivesem.run.records import from_json
 from drivesem.synth.write import Order, synthesise
 from drivesem.video import clips as taking
 from drivesem.video import run as running
 from drivesem.video.clips import DerenderedClip
+from drivesem.video.objective import ClipObjective
 from drivesem.video.report import DriveResult, write_page
 from scene_ir import files
 from scene_ir.io import load_scene
-from scene_ir.types import SceneIR
+from scene_ir.types import Category, SceneIR
 from tests.drivesem.invoke import invoke, refusal, run_json
 from tests.drivesem.video.clips import clip_of
 
@@ -65,17 +72,17 @@ def test_what_is_written(finished: Path, taken: DerenderedClip) -> None:
     assert data["params"] == ["color", "translate"]
     assert data["feasible"] == 3
     assert data["queries"] == 1
-    assert sorted(car["track"] for car in data["cars"]) == [4, 7, 9]
-    for car in data["cars"]:
+    assert sorted(car["track"] for car in data["tracks"]) == [4, 7, 9]
+    for car in data["tracks"]:
         assert set(car["states"]) == {"before", "after", "control"}
         for state, letters in car["states"].items():
             assert len(letters) == 3
             assert car[f"lost_{state}"] == letters.count("l")
         assert car["frames"] == sum(letter in "fl" for letter in car["states"]["after"])
-    (last,) = (car for car in data["cars"] if car["track"] == 9)
+    (last,) = (car for car in data["tracks"] if car["track"] == 9)
     assert [way is None for way in last["path_m"]] == [False, True, False]
     assert last["states"]["after"][1] == " "
-    assert any(name.startswith("cars[4].paint") for name in data["theta"])
+    assert any(name.startswith("tracks[4].paint") for name in data["theta"])
     for name in taken.names:
         for side in ("before", "after"):
             assert files.read_image(finished / "frames" / name / f"{side}.jpg").shape == (188, 621, 3)
@@ -108,6 +115,33 @@ def test_a_clip_that_memory_cannot_hold_is_refused(tmp_path: Path, monkeypatch: 
         "CLIP: frames: expected at most 6 frames, which fit into 0.5 GB of memory (--limit takes the first), found 30"
     )
     assert not (tmp_path / "out" / "scenes").exists()
+
+
+def test_people_need_a_clip(tmp_path: Path) -> None:
+    words = ("drive", "--target-classes", "Pedestrian", "--out", tmp_path / "out")
+    assert refusal(*words) == "--people: expected a CLIP with people, found none"
+
+
+def test_only_targeted_classes_count(street: Callable[..., SceneIR]) -> None:
+    """The second object is a pedestrian; the cars change, and are not judged."""
+    clip = clip_of(street, 1, drawn=True)
+    category = torch.tensor([int(Category.CAR), int(Category.PEDESTRIAN), int(Category.CAR)])
+    clip = replace(clip, scenes=tuple(scene.with_objects(category=category) for scene in clip.scenes))
+    config = DriveConfig(clip="clip", target_classes="Pedestrian")
+    objective = ClipObjective(clip, load_predictor("squeezedet"), (Parameter.COLOR,), Budget(), config)
+    detection = objective.match_frame(0, objective.frames[0].benign)
+    assert detection.counted == (False, True, False)
+    assert objective.space.count == 3
+    with pytest.raises(
+        UsageError, match="objects of Truck that are large and visible enough to count, found none in 1 frame"
+    ):
+        ClipObjective(
+            clip,
+            load_predictor("squeezedet"),
+            (Parameter.COLOR,),
+            Budget(),
+            replace(config, target_classes="Truck"),
+        )
 
 
 def test_the_table_names_cars(finished: Path) -> None:
@@ -156,14 +190,17 @@ def test_a_slider_shows_frames_in_a_browser(chromium: Any, finished: Path) -> No
 def test_what_the_generator_wrote(layout: str, tmp_path: Path) -> None:
     people = layout == "kitti"
     variations = ("mixed",) if people else ("clone",)
-    order = Order(tmp_path / "data", 3, 5, layout, sequence=3, people=people, variations=variations)
+    order = Order(tmp_path / "data", 3, 1, layout, "heldout", sequence=3, people=people, variations=variations)
     assert len(list(synthesise(order))) == 3
     out = tmp_path / "out"
     words = ["drive", str(tmp_path / "data"), "--params", "color", "--steps", "1", "--certify", "0", "--no-fit"]
+    words += ["--people"] if people else []
     words += ["--workers", "1", "--out", str(out), "--json"]
     data = json.loads(invoke(*words).out)
     assert data["frames"] == 3
-    assert data["cars"]
+    kinds = {one["kind"] for one in data["tracks"]}
+    assert {"Car", *(["Pedestrian"] if people else [])} <= kinds
+    assert data["feasible"] == 3
     meshes: dict[str, set[str]] = {}
     for name in data["names"]:
         scene = load_scene(out / "scenes" / name)
@@ -190,4 +227,4 @@ def test_a_killed_command_goes_on(tmp_path: Path) -> None:
         data = run_json(*words, "--out", out)
         found.append({key: value for key, value in data.items() if key not in ("out", "seconds")})
     assert found[0] == found[1]
-    assert len(found[0]["cars"]) >= 3
+    assert len(found[0]["tracks"]) >= 3

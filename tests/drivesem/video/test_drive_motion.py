@@ -1,8 +1,9 @@
-"""Cars do not tremble: in the pictures of a changed clip they move as their places do."""
+"""Objects do not tremble: in the pictures of a changed clip they move as their places do."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +12,8 @@ import torch
 
 from drivesem.attacks.space import ParameterSpace
 from drivesem.synth.demo import make_drive
-from drivesem.video.clips import DerenderedClip, object_tracks
+from drivesem.synth.write import Order, synthesise
+from drivesem.video.clips import ClipDerenderer, ClipSource, DerenderedClip, object_tracks
 from drivesem.video.objective import ClipSpace
 from scene_ir.derender.silhouette import Placement
 from scene_ir.geometry import to_clip
@@ -83,6 +85,31 @@ def test_cars_move_as_their_places_do(street: Callable[..., SceneIR]) -> None:
     watched, meant = Watched(clip), changed(clip)
     assert max(watched.trembling_px(meant, meant, 4, 7)) < STEADY_PX
     assert min(watched.trembling_px(changed(clip, NOISE_M), meant, 4, 7)) > 3 * STEADY_PX
+
+
+@pytest.mark.slow
+def test_people_of_a_generated_clip_walk_as_their_places_do(tmp_path: Path) -> None:
+    """Each is cut out of each frame anew; the shifted place stays on the ground, and the picture follows it."""
+    assert len(list(synthesise(Order(tmp_path / "data", 4, 9, "kitti", "heldout", sequence=4)))) == 4
+    source = ClipSource(str(tmp_path / "data"), None, None, 0, fit=False, keep_going=False, people=True)
+    derenderer = ClipDerenderer(source, tmp_path / "scenes")
+    names = derenderer.frames.names
+    scenes = tuple(derenderer.frames.scene(name) for name in names)
+    clip = DerenderedClip(derenderer.frames.name, names, scenes, tuple(map(object_tracks, scenes)))
+    walking = [
+        track
+        for track in clip.tracks[0]
+        if all(track in of_frame for of_frame in clip.tracks)
+        and bool(scenes[0].objects.upright[clip.tracks[0].index(track)])
+    ]
+    assert walking
+    meant = changed(clip)
+    for frame, scene in enumerate(scenes):
+        rows = [clip.tracks[frame].index(track) for track in walking]
+        offset = (meant[frame].objects.translation - scene.objects.translation)[rows]
+        assert float((offset @ scene.environment.ground[:3]).abs().max()) < 1e-5
+        assert float(offset.norm(dim=1).min()) > 0.01
+    assert max(Watched(clip).trembling_px(meant, meant, *walking)) < 2 * STEADY_PX  # limbs move, too
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import base64
 import re
 import shlex
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlencode, urlsplit
@@ -13,11 +14,16 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from drivesem.attacks.budgets import PRESETS
 from drivesem.cli import main
-from drivesem.viewer.server import Server, Viewer
+from drivesem.viewer.server import Server, Viewer, ViewerFrame
 from scene_ir import files
-from scene_ir.io import to_uint8
+from scene_ir.io import save_scene, to_uint8
+from scene_ir.render.sources import photograph_scene
+from scene_ir.types import Category, SceneIR
+from tests.drivesem.viewer.conftest import GRID, SCORE, Stubborn
 
 CHANGED = "<b>changed</b>"
 FAITHFUL_DB = 34.0
@@ -30,8 +36,10 @@ def opened(chromium: Any, server: Server) -> Iterator[Callable[..., Any]]:
     complaints: list[str] = []
     requested: list[str] = []
     contexts = []
+    hosts = [server.url]
 
-    def at(width: int = 1400, height: int = 900, **link: Any) -> Any:
+    def at(width: int = 1400, height: int = 900, server: Server = server, **link: Any) -> Any:
+        hosts.append(server.url)
         context = chromium.new_context(viewport={"width": width, "height": height})
         context.grant_permissions(["clipboard-read", "clipboard-write"], origin=server.url.rstrip("/"))
         contexts.append(context)
@@ -46,7 +54,7 @@ def opened(chromium: Any, server: Server) -> Iterator[Callable[..., Any]]:
     yield at
     for context in contexts:
         context.close()
-    there = (server.url, f"blob:{server.url}", "data:,")
+    there = (*hosts, *(f"blob:{url}" for url in hosts), "data:,")
     assert not [url for url in requested if not url.startswith(there)]
     dropped = "409"  # what a later request superseded
     assert not [shortcuts for shortcuts in complaints if dropped not in shortcuts]
@@ -102,6 +110,42 @@ def test_a_slider_moves_picture_boxes_link_and_command(opened: Callable[..., Any
     settle(page)
     assert "objects[0].translate.along" not in state(page)
     assert page.inner_text("#command").startswith("drivesem render ")
+
+
+def test_a_person_is_an_object_with_sliders(
+    opened: Callable[..., Any],
+    served: Callable[[Viewer], Any],
+    street: Callable[..., SceneIR],
+    tmp_path: Path,
+) -> None:
+    """Its own sliders, one chip named by its class, and a picture that place and colour change."""
+    scene = street([(-2.5, 9.0), (2.5, 12.0)])
+    category = torch.tensor([int(Category.CAR), int(Category.PEDESTRIAN)])
+    scene = photograph_scene(scene.with_objects(category=category))
+    save_scene(scene, tmp_path / "crossing")
+    frames = {"crossing": ViewerFrame(tmp_path / "crossing")}
+    viewer = Viewer("people", frames, Stubborn(scene), PRESETS["street"], grid=GRID)
+    with closing(viewer), served(viewer) as server:
+        page = opened(server=server, frame="crossing", car=1)
+        assert page.locator("#cars button").all_inner_texts() == [
+            f"0 car\n{SCORE:.2f}",
+            f"1 pedestrian\n{SCORE:.2f}",
+        ]
+        assert page.locator("#map-car").inner_text() == "Pedestrian 1"
+        assert page.locator("#car-sliders legend").all_inner_texts() == ["Place", "Colour", "Size and shape"]
+        slider = slider_of(page, "objects[1].translate.across")
+        assert (slider.get_attribute("min"), slider.get_attribute("max")) == ("-2", "2")
+        for name, value in (("translate.across", "1"), ("paint.lightness", "0.5")):
+            before = page.locator("#after").get_attribute("src")
+            slider_of(page, f"objects[1].{name}").fill(value)
+            page.wait_for_selector("#view:not([data-settled])", state="attached")
+            settle(page)
+            assert page.locator("#after").get_attribute("src") != before
+        wanted = {"objects[1].translate.across": 1.0, "objects[1].paint.lightness": 0.5}
+        expected = to_uint8(viewer.scene("crossing").render_state(wanted).render.image)
+        assert cv2.PSNR(pixels(page), expected) > FAITHFUL_DB
+        assert "'objects[1].translate=0m,1m'" in page.inner_text("#command")
+        page.close()
 
 
 def test_the_copied_command_draws_the_picture(

@@ -57,6 +57,25 @@ def test_only_the_hole_is_filled_and_from_the_street(street, shrink: int) -> Non
     assert np.array_equal(behind.fill_hole(hole, 0), behind.fill_hole(hole, 0))
 
 
+@pytest.mark.parametrize("tall", [60, 150])
+def test_behind_a_person_what_is_near_goes_on_and_nobody_is_copied(street, tall: int) -> None:
+    around, shape = surroundings(street), street.mask.shape
+    stripes = np.broadcast_to((np.arange(shape[0]) // 8 % 2)[:, None, None], (*shape, 3))
+    wall = (0.3 + 0.4 * stripes).astype(np.float32)
+    person, other = np.zeros(shape, bool), np.zeros(shape, np.float32)
+    person[10 : 10 + tall, 200 : 200 + tall // 3] = True
+    other[10 : 10 + tall, 260:280] = 1
+    image = np.where(person[..., None], (0.9, 0.1, 0.1), wall)
+    image = np.where(other[..., None] > 0, (0.1, 0.9, 0.1), image).astype(np.float32)
+    inputs = replace(around, maps=replace(around.maps, person=other))
+    behind = BackgroundFill(image, np.full(shape, 9.0, np.float32), inputs)
+    found = behind.fill_thin(image, person)
+    assert np.array_equal(found[~person], image[~person])
+    assert np.array_equal(found, behind.fill_thin(image, person)), "the same again"
+    assert np.abs(found - wall)[person].mean() < 0.06
+    assert np.ptp(found[person], axis=1).max() < 0.1, "grey, as the wall"
+
+
 def test_one_is_the_photographs_own_size(street) -> None:
     around = surroundings(street).scaled_down(1)
     assert isinstance(around.camera, Camera)

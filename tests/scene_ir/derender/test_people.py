@@ -208,6 +208,54 @@ def test_people_who_overlap_stay_background(crossing):
     assert {scene.provenance[f"labels[{row}].background"] for row in (1, 2)} == {"overlaps others"}
 
 
+def split_person(crossing, share: float) -> Frame:
+    """The crossing with its person labelled as a cyclist's upper part, and a bicycle's lower one."""
+    mask = crossing.masks[1].numpy()
+    rows = np.flatnonzero((mask > 0.5).any(1))
+    edge = rows[0] + round(share * len(rows))
+    parts = [mask.copy(), mask.copy()]
+    parts[0][edge + 5 :], parts[1][: edge - 5] = 0, 0
+    labels = label_person(crossing.labels.select([0]), parts[0] > 0.5, kind="Cyclist")
+    labels = label_person(labels, parts[1] > 0.5, kind="Bicycle")
+    masks = torch.cat([crossing.masks[:1], torch.from_numpy(np.stack(parts))])
+    return replace(crossing, labels=labels, masks=masks, provenance={"labels[1].name": "rider"})
+
+
+def test_rider_and_two_wheeler_with_labels_of_their_own_are_one_object(crossing):
+    frame = split_person(crossing, 0.8)
+    boxes = frame.labels.boxes_xyxy.clone()
+    boxes[1, 3] = boxes[2, [1, 3]].mean()  # the feet are beside the wheels
+    labels = replace(frame.labels, boxes_xyxy=boxes)
+    scene = derender(replace(frame, labels=labels), DerenderSettings(fit=False, people=True))
+    assert scene.objects.category.tolist() == [Category.CAR, Category.CYCLIST]
+    assert torch.equal(scene.objects.box2d[1], labels.boxes_xyxy[1].float()), "the label stays the data set's"
+    assert scene.other_labels.kind == (), "the two-wheeler moves with its rider"
+    whole = frame.masks[1:].amax(0).numpy() > 0.5
+    crop = scene.objects.source[1].foreground
+    height = np.flatnonzero((crop.values[3].numpy() > 0.5).any(1))
+    assert len(height) == pytest.approx(np.flatnonzero(whole.any(1)).size, abs=4)
+
+
+def test_a_rider_without_a_two_wheeler_stays_background(crossing):
+    frame = split_person(crossing, 0.8)
+    frame = replace(frame, labels=frame.labels.select([0, 1]), masks=frame.masks[:2])
+    scene = derender(frame, DerenderSettings(fit=False, people=True))
+    assert scene.objects.category.tolist() == [Category.CAR]
+    assert scene.provenance["labels[1].background"] == "no two-wheeler"
+
+
+def test_each_rider_has_the_two_wheeler_that_overlaps_most(crossing):
+    boxes = torch.tensor(
+        [[0.0, 0, 20, 40], [8, 0, 28, 40], [2, 25, 22, 60], [15, 15, 35, 60], [300, 0, 320, 40], [0, 100, 20, 140]]
+    )
+    kinds = ("Cyclist", "Cyclist", "Bicycle", "Motorcycle", "Bicycle", "Cyclist")
+    labels = replace(crossing.labels.select([0] * 6), kind=kinds, boxes_xyxy=boxes)
+    whole, ridden = people.join_riders(labels)
+    assert ridden == {0: 2, 1: 3}
+    assert whole[:2].tolist() == [[0, 0, 22, 60], [8, 0, 35, 60]]
+    assert torch.equal(whole[2:], boxes[2:])
+
+
 def test_the_network_finds_the_person_in_its_box(crossing):
     frame = replace(crossing, masks=None)
     picture = np.rint(crossing.photograph.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
