@@ -139,7 +139,9 @@ class SearchLog:
             return ()
         cells = _join([state.patches for state in self._states]).cells()
         states = [state for state in self._states for _ in state.objects]
-        objects, missed = (torch.cat([getattr(s, name) for s in self._states]) for name in ("objects", "missed"))
+        objects, missed = (
+            torch.cat([getattr(state, name).cpu() for state in self._states]) for name in ("objects", "missed")
+        )
         counts: dict[tuple[int, Cell], np.ndarray] = {}
         for index, cell, state, miss in zip(objects.tolist(), cells, states, missed.tolist(), strict=True):
             row = np.array([state.passes, miss, state.random, state.random and miss])

@@ -210,6 +210,7 @@ def test_margins_of_several_points_are_found_together(tmp_path: Path, monkeypatc
         found = oracle.margins([0.5 * upper, -0.5 * upper, 0 * upper], [3, 4, 3])
         assert objective.passes == passes + 3
         assert len(objective.search_log.margin_rows()) >= 3
+        assert sum(visit.passes for visit in objective.cell_visits(objective.benign)) >= 3
         return found.cpu(), sizes
 
     here, one_by_one = margins("cpu")
