@@ -239,7 +239,7 @@ def test_questions_on_a_run(tmp_path: Path) -> None:
         "--params",
         ALL,
         "--method",
-        "climb",
+        "corners",
         "--passes",
         "40",
         "--budget",
