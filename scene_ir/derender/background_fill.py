@@ -169,7 +169,10 @@ class BackgroundFill:
         moved = cv2.cvtColor(moved, cv2.COLOR_Lab2RGB).astype(np.float32) / 255
         image = filled.copy()
         full = np.clip(cv2.resize(moved, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
-        image[window] = _hide_seam(np.where(hole[..., None], full, filled[window]), hole, _SEAM * (y1 - y0))
+        around = push_pull(filled[window], 1 - unknown.astype(np.float32))  # without the colours of other people
+        patched = np.where(hole[..., None], full, np.where(unknown[..., None], around, filled[window]))
+        hidden = _hide_seam(patched.astype(np.float32), hole, _SEAM * (y1 - y0))
+        image[window] = np.where(hole[..., None], hidden, filled[window])
         return image
 
     def _fill_hole(self, hole: Mask, seed: int) -> Array:

@@ -64,7 +64,7 @@ def test_behind_a_person_what_is_near_goes_on_and_nobody_is_copied(street, tall:
     wall = (0.3 + 0.4 * stripes).astype(np.float32)
     person, other = np.zeros(shape, bool), np.zeros(shape, np.float32)
     person[10 : 10 + tall, 200 : 200 + tall // 3] = True
-    other[10 : 10 + tall, 260:280] = 1
+    other[10 : 10 + tall, 200 + tall // 3 : 260 + tall // 3] = 1  # next to each other
     image = np.where(person[..., None], (0.9, 0.1, 0.1), wall)
     image = np.where(other[..., None] > 0, (0.1, 0.9, 0.1), image).astype(np.float32)
     inputs = replace(around, maps=replace(around.maps, person=other))
