@@ -231,6 +231,7 @@ def test_a_clip(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_questions_on_a_run(tmp_path: Path) -> None:
     """A certain failure looked around, explained, drawn again and shown to another detector."""
     found = tmp_path / "found"
