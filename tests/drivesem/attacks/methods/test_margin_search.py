@@ -140,7 +140,7 @@ def test_climb_ends_lower_than_its_first_samples(gradient: bool) -> None:
     assert sum(gains) / len(gains) > 0.3, gains
 
 
-def test_random_points_of_a_start_are_uniform_in_the_box_whatever_the_margins() -> None:
+def test_random_points_of_a_start_are_uniform_and_do_not_depend_on_margins() -> None:
     streets = [Street(), Street(ripple=5.0)]
     for street in streets:
         Climb(passes=200)(street.problem(), START, 3)
