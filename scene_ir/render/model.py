@@ -134,6 +134,9 @@ CLEAN_ROOF = 0.75
 """Share of the dust that does not stick to the roof."""
 DUST_RGB = (0.47, 0.42, 0.35)
 """Dry road dust."""
+WAIST = (0.51, 0.55)
+"""Shares of a person's height between which the codes of the clothes below and above the waist blend: about the hip
+joint, at 0.53 (Drillis and Contini 1966, in Winter, Biomechanics and Motor Control of Human Movement, figure 4.1)."""
 LEVEL = (0.01, 0.99)
 """Bounds of L* / 100 before its logit is taken."""
 GAMUT_SHARPNESS = 20.0
