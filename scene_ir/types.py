@@ -443,6 +443,12 @@ class SceneIR:
         return replace(self, environment=replace(self.environment, **changes))
 
     @property
+    def riders(self) -> Tensor:
+        """(N,) bool, cyclists with a known heading: where places are estimated, people have none."""
+        known = self.provenance.get("places") != "estimated"
+        return (self.objects.category == Category.CYCLIST) & known
+
+    @property
     def origin(self) -> SceneIR:
         """The scene before vehicles were exchanged, added or removed; itself if none was."""
         return self if self.before is None else self.before

@@ -216,8 +216,10 @@ class PhotographRenderer:
                 self._occluder_layers(window),
             )
         image = shading.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
-        lamps = np.where(objects.upright.cpu().numpy(), -1.0, to_numpy(objects.lamps))  # people have none
-        image = apply_night(image, depth_m, owner, environment, camera, poses, lamps)
+        riders = self._still.riders.cpu().numpy()
+        unlit = objects.upright.cpu().numpy() & ~riders
+        lamps = np.where(unlit, -1.0, to_numpy(objects.lamps))
+        image = apply_night(image, depth_m, owner, environment, camera, poses, lamps, riders)
         if environment.ego is not None:
             inside = darken_inside(self._photograph, environment)
             image = image + (inside - image) * to_numpy(environment.ego)[..., None]
