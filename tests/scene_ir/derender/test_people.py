@@ -175,7 +175,7 @@ def test_code_zero_of_clothes_changes_no_bit(scene):
     )
 
 
-@pytest.mark.parametrize("start", [0.0, 0.3])
+@pytest.mark.parametrize("start", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_the_gradient_of_clothes_is_that_of_differences_and_the_kernels(scene, start):
     weights = torch.linspace(0, 1, scene.camera.height)[:, None]
     chosen, slopes = [0, 1, 2, 5, 6, 7], {}
