@@ -21,6 +21,7 @@ from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import clamp_inclusive, yaw_matrix
 from scene_ir.types import (
+    CLOTHES_DIM,
     DAYLIGHT_DIM,
     FOLIAGE_DIM,
     LATTICE,
@@ -161,7 +162,7 @@ def _color_spec(size: int) -> ParameterSpec:
 
 
 SPECS: dict[Parameter, ParameterSpec] = {
-    Parameter.COLOR: _color_spec(TEXTURE_DIM),
+    Parameter.COLOR: _color_spec(CLOTHES_DIM),
     Parameter.WEATHER: _weather_spec(WEATHER_DIM),
     Parameter.FOLIAGE: ParameterSpec(
         FOLIAGE_DIM, False, "code", tuple(f"foliage.{n}" for n in ("hue", "lightness", "density"))
