@@ -34,7 +34,7 @@ _LOWEST, _HIGHEST = -4.0, 6.0
 _TREES, _TREES_OF_PROPOSAL = 48, 3
 """Trees; and of how many of them a proposal takes the mean. Others of the 48 differ where little is known, so
 proposals spread there (Thompson sampling)."""
-_POOL = 24
+_POOL = 8
 """Points that are rendered for predictions before each round; proposals combine all so far."""
 _START, _ROUND = 16, 8
 """Points of the first round and of each other one. The model proposes half of them; without a model these are drawn

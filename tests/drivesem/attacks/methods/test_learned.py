@@ -41,8 +41,8 @@ def lost(method: Climb | Learn, seed: int) -> tuple[int, int]:
 
 def test_what_earlier_frames_met_is_found_in_fewer_passes() -> None:
     seeds = range(6)
-    blind = np.sum([lost(Climb(passes=48), seed) for seed in seeds], 0)
-    knowing = np.sum([lost(Learn(passes=48, model=MarginModel(spot_rows())), seed) for seed in seeds], 0)
+    blind = np.sum([lost(Climb(passes=60), seed) for seed in seeds], 0)
+    knowing = np.sum([lost(Learn(passes=60, model=MarginModel(spot_rows())), seed) for seed in seeds], 0)
     assert knowing[0] >= blind[0] + 4  # of 24 cars
     assert knowing[1] < blind[1]
 
