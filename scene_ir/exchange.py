@@ -22,7 +22,6 @@ from scene_ir.render.compositor import Compositor
 from scene_ir.render.sources import analytic_shadows
 from scene_ir.types import (
     LATTICE_POINTS,
-    TEXTURE_DIM,
     Category,
     Crop,
     Mesh,
@@ -252,7 +251,7 @@ def _object_row(vehicle_render: _RenderedVehicle, mesh: int, scene: SceneIR) -> 
         yaw=vehicle.yaw.to(like)[None],
         size_lhw=vehicle.size_lhw.to(like)[None],
         ffd=like.new_zeros(1, LATTICE_POINTS, 3),
-        texture_code=like.new_zeros(1, TEXTURE_DIM),
+        texture_code=like.new_zeros(1, scene.objects.texture_code.shape[1]),
         category=torch.tensor([int(vehicle.category)]),
         box2d=scene.objects.box2d.new_zeros(1, 4),
         truncation=scene.objects.truncation.new_zeros(1),

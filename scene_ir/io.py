@@ -29,6 +29,7 @@ from torch import Tensor
 from scene_ir import files
 from scene_ir.errors import FormatError, SceneError
 from scene_ir.types import (
+    CLOTHES_DIM,
     FOLIAGE_DIM,
     LATTICE_POINTS,
     LIGHT_DIM,
@@ -191,11 +192,13 @@ def _load(folder: Path, with_before: bool) -> SceneIR:
     occluders = tuple(_load_occluder(i, node, arrays) for i, node in enumerate(root["front"].items()))
     objects_node, environment_node = root["objects"], root["environment"]
     count = objects_node["translation"].rows()
+    parted = objects_node["texture_code"].columns() == CLOTHES_DIM
+    shapes = _OBJECT_FIELDS | {"texture_code": (CLOTHES_DIM if parted else TEXTURE_DIM,)}
     objects = objects_node.build(
         lambda: Objects(
             **{
                 name: objects_node[name].tensor(count, *shape, integer=name in _INTEGERS)
-                for name, shape in _OBJECT_FIELDS.items()
+                for name, shape in shapes.items()
                 if name != "lamps" or name in objects_node.mapping()  # scenes saved before there were any
             },
             source=sources,
@@ -453,6 +456,11 @@ class _JsonNode:
     def rows(self) -> int:
         """Size of a tensor's first axis."""
         return len(_JsonNode(self.where, self._values()[0]).items())
+
+    def columns(self) -> int:
+        """Size of a tensor's second axis; 0 without rows."""
+        rows = _JsonNode(self.where, self._values()[0]).items()
+        return len(rows[0].items()) if rows else 0
 
     def tensor(self, *shape: int, integer: bool = False) -> Tensor:
         """The nested lists as a tensor of `shape`."""

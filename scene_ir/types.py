@@ -22,6 +22,8 @@ LATTICE = (4, 4, 4)
 LATTICE_POINTS = LATTICE[0] * LATTICE[1] * LATTICE[2]
 TEXTURE_DIM = 5
 """Texture code: lightness, a*, b*, gloss, dirt."""
+CLOTHES_DIM = TEXTURE_DIM + 3
+"""Texture code in scenes that may hold people: also lightness, a*, b* of a pedestrian's clothes below the waist."""
 LIGHT_DIM = 3
 """Light code: the sun's azimuth (to the right), elevation (up), strength."""
 FOLIAGE_DIM = 3
@@ -269,7 +271,7 @@ class Objects:
     ffd: Tensor
     """(N, P, 3) lattice offsets, fractions of the unit box."""
     texture_code: Tensor
-    """(N, 5) in (-1, 1)."""
+    """(N, 5) in (-1, 1), or (N, 8), see `CLOTHES_DIM`; with 5, a pedestrian's clothes change alike."""
     category: Tensor
     """(N,) int64, a `Category`."""
     box2d: Tensor
@@ -290,7 +292,8 @@ class Objects:
         check_shape("objects.yaw", self.yaw, n)
         check_shape("objects.size_lhw", self.size_lhw, n, 3)
         check_shape("objects.ffd", self.ffd, n, LATTICE_POINTS, 3)
-        check_shape("objects.texture_code", self.texture_code, n, TEXTURE_DIM)
+        parts = isinstance(self.texture_code, Tensor) and self.texture_code.shape[1:] == (CLOTHES_DIM,)
+        check_shape("objects.texture_code", self.texture_code, n, CLOTHES_DIM if parts else TEXTURE_DIM)
         check_shape("objects.category", self.category, n, floating=False)
         check_shape("objects.box2d", self.box2d, n, 4)
         check_shape("objects.truncation", self.truncation, n)
@@ -312,6 +315,11 @@ class Objects:
     def upright(self) -> Tensor:
         """(N,) bool, which are upright surfaces, not vehicles."""
         return torch.isin(self.category, self.category.new_tensor(UPRIGHT))
+
+    @property
+    def parted(self) -> Tensor:
+        """(N,) bool, objects with a texture code of their own below the waist."""
+        return (self.category == Category.PEDESTRIAN) & (self.texture_code.shape[1] == CLOTHES_DIM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -433,6 +441,12 @@ class SceneIR:
     def with_environment(self, **changes: Tensor) -> SceneIR:
         """The same scene with some fields of `environment` replaced."""
         return replace(self, environment=replace(self.environment, **changes))
+
+    @property
+    def riders(self) -> Tensor:
+        """(N,) bool, cyclists with a known heading: where places are estimated, people have none."""
+        known = self.provenance.get("places") != "estimated"
+        return (self.objects.category == Category.CYCLIST) & known
 
     @property
     def origin(self) -> SceneIR:

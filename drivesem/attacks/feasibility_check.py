@@ -61,11 +61,13 @@ MINIMUM_PX = 8.0
 MINIMUM_TOLERANCE_PX = 1.0
 WEATHER_TOLERANCE = 0.01
 """Tolerance of weather codes and their limits."""
-PEOPLE = (2, 3)
+PEDESTRIAN = 2
+PEOPLE = (PEDESTRIAN, 3)
 """Categories of people and cyclists."""
 PEOPLE_TURN, PEOPLE_GROWTH, PEOPLE_COLOR = math.radians(5), 0.05, np.array([0.5, 0.5, 0.5, 0.0, 0.0])
 """rad, share of their size, and codes of their clothes, by which people may change; they do not bend, and have no
-lamps."""
+lamps. Codes after the fifth are those below the waist, of pedestrians alone."""
+LOWER_COLOR = 0.5
 LEVEL_SHARE = 0.18
 """Difference of the background's depth from the ground plane's, as a share, up to which a person can stand there."""
 _NIGHT, _SNOW = 4, 5
@@ -261,6 +263,7 @@ class _MeasuredPose:
         self.size = objects.size_lhw[i].detach().double().numpy()
         self.lattice = objects.ffd[i].detach().double().numpy().reshape(4, 4, 4, 3)
         self.person = int(objects.category[i]) in PEOPLE
+        self.lower_color = LOWER_COLOR if int(objects.category[i]) == PEDESTRIAN else 0.0
         self.lamps = float(objects.lamps[i])
         self.colour = objects.texture_code[i].detach().double().numpy()
         self.whole = int(objects.occlusion[i]) == 0 and float(objects.truncation[i]) <= MAX_CUT
@@ -513,8 +516,12 @@ def _shape_violations(old: _MeasuredPose, new: _MeasuredPose, limits: ChangeLimi
         violations.append("size changed, and not alike in length, height and width")
     if old.person and new.lamps != old.lamps:
         violations.append("lamps of a person")
-    if old.person and (np.abs(new.colour) > np.maximum(PEOPLE_COLOR, np.abs(old.colour)) + LIMIT_TOLERANCE).any():
+    most = np.append(PEOPLE_COLOR if old.person else np.ones(5), np.full(3, old.lower_color))[: len(new.colour)]
+    exceeds = np.abs(new.colour) > np.maximum(most, np.abs(old.colour)) + LIMIT_TOLERANCE
+    if old.person and exceeds.any():
         violations.append(f"clothes recoloured by {np.abs(new.colour).max():.2f}")
+    elif exceeds[5:].any():
+        violations.append("recoloured below the waist, without one")
     return violations
 
 

@@ -18,7 +18,7 @@ from scene_ir import ffd
 from scene_ir.errors import RangeError
 from scene_ir.removal import remove_objects
 from scene_ir.render.night import measure_daylight
-from scene_ir.types import SceneIR, Weather
+from scene_ir.types import CLOTHES_DIM, TEXTURE_DIM, Objects, SceneIR, Weather
 
 REMOVED = "removed"
 """Provenance key of a scene from which vehicles were removed."""
@@ -74,7 +74,8 @@ def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) 
         bent: a state of the scene with changed shapes, for edits that set shares of them.
 
     Raises:
-        RangeError: the edit names a row that the scene lacks, or a share of a shape without `bent`.
+        RangeError: the edit names a row that the scene lacks, clothes that a row lacks, or a share of a shape without
+            `bent`.
     """
     changes = _by_row(scene, edit)
     objects, environment = scene.objects, scene.environment
@@ -95,7 +96,10 @@ def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) 
         none = (0.0,) * ffd.SYMMETRIC_DIM
         bend = summed([[none, *(c.mesh or none for c in row)] for row in changes])
         grown = summed([[(1.0,), *((c.size,) for c in row)] for row in changes])
-        paint = summed([[(0.0,) * objects.texture_code.shape[1], *(c.color for c in row)] for row in changes])
+        none_painted = (0.0,) * objects.texture_code.shape[1]
+        paint = summed(
+            [[none_painted, *(_texture_code(objects, i, c) for c in row)] for i, row in enumerate(changes)]
+        )
         lamps = summed([[(0.0,), *((c.lamps,) for c in row)] for row in changes])[:, 0]
         changed_fields = {
             "translation": objects.translation + shift.sum(dim=1),
@@ -113,6 +117,16 @@ def apply_changes(scene: SceneIR, edit: FrameEdit, bent: SceneIR | None = None) 
         light=(environment.light + environment.light.new_tensor(edit.sun)).clamp(-1.0, 1.0),
         drops=(environment.drops + edit.drops).clamp(0.0, 1.0),
     )
+
+
+def _texture_code(objects: Objects, row: int, change: ObjectEdit) -> tuple[float, ...]:
+    """The texture code of a row; five codes change all clothes of a pedestrian alike."""
+    parted = bool(objects.parted[row])
+    lower = change.color[TEXTURE_DIM:] or change.color[:3] * parted
+    if any(lower) and not parted:
+        expected = f"{TEXTURE_DIM} codes; {CLOTHES_DIM} are for pedestrians, in scenes de-rendered with --people"
+        raise RangeError(f"objects[{row}].color", expected, f"{len(change.color)} codes")
+    return (*change.color[:TEXTURE_DIM], *lower, 0.0, 0.0, 0.0)[: objects.texture_code.shape[1]]
 
 
 def _shape_shares(scene: SceneIR, changes: list[list[ObjectEdit]], bent: SceneIR | None) -> Tensor:

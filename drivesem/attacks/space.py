@@ -21,6 +21,7 @@ from scene_ir import ffd
 from scene_ir.errors import FormatError, RangeError, ShapeError
 from scene_ir.geometry import clamp_inclusive, yaw_matrix
 from scene_ir.types import (
+    CLOTHES_DIM,
     DAYLIGHT_DIM,
     FOLIAGE_DIM,
     LATTICE,
@@ -146,6 +147,8 @@ _HALF_LATTICE = (LATTICE[0], LATTICE[1], LATTICE[2] // 2)
 _WEATHER_NAMES = tuple(
     f"weather.{'time_of_day' if code is Weather.TIME else code.name.lower()}" for code in Weather
 )
+_TINT = ("lightness", "a", "b")
+_PAINT_NAMES = tuple(f"paint.{n}" for n in (*_TINT, "gloss", "dirt", *(f"lower_{n}" for n in _TINT)))
 
 
 def _weather_spec(size: int) -> ParameterSpec:
@@ -153,10 +156,13 @@ def _weather_spec(size: int) -> ParameterSpec:
     return ParameterSpec(size, False, "code", _WEATHER_NAMES[:size])
 
 
+def _color_spec(size: int) -> ParameterSpec:
+    """The first `size` texture codes."""
+    return ParameterSpec(size, True, "code", _PAINT_NAMES[:size])
+
+
 SPECS: dict[Parameter, ParameterSpec] = {
-    Parameter.COLOR: ParameterSpec(
-        TEXTURE_DIM, True, "code", tuple(f"paint.{n}" for n in ("lightness", "a", "b", "gloss", "dirt"))
-    ),
+    Parameter.COLOR: _color_spec(CLOTHES_DIM),
     Parameter.WEATHER: _weather_spec(WEATHER_DIM),
     Parameter.FOLIAGE: ParameterSpec(
         FOLIAGE_DIM, False, "code", tuple(f"foliage.{n}" for n in ("hue", "lightness", "density"))
@@ -191,7 +197,7 @@ _MAX_TRUNCATION = 0.1
 
 
 _UPRIGHT_LIMITS: dict[Parameter, float | tuple[float, ...]] = {
-    Parameter.COLOR: (0.5, 0.5, 0.5, 0.0, 0.0),
+    Parameter.COLOR: (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.5, 0.5),
     Parameter.ROTATE: math.radians(5),
     Parameter.MESH: 0.0,
     Parameter.SIZE: 0.05,
@@ -303,7 +309,7 @@ class Perturbation:
     """theta by parameter, as changes from the photographed scene; None for a fixed parameter."""
 
     color: Tensor | None = None
-    """(N, 5), codes."""
+    """(N, 5) or (N, 8), codes."""
     weather: Tensor | None = None
     """(6,), codes; without snow in the budget (5,), and without night either the paper's (4,)."""
     foliage: Tensor | None = None
@@ -383,6 +389,7 @@ class ParameterSpace(ThetaSpace[Parameter]):
         specs = SPECS | {Parameter.TRANSLATE: _ROI_TRANSLATE} if parametrisation == "roi" else SPECS
         past = Weather.SNOW if self.budget.night else DAYLIGHT_DIM
         specs = specs if self.budget.snow else specs | {Parameter.WEATHER: _weather_spec(past)}
+        specs = specs | {Parameter.COLOR: _color_spec(scene.objects.texture_code.shape[1])}
         super().__init__(
             select_parameters(Parameter, params), specs, len(scene.objects), scene.objects.translation
         )
@@ -400,11 +407,14 @@ class ParameterSpace(ThetaSpace[Parameter]):
             self.step[where] = getattr(self.steps, parameter.value)
             if specs[parameter].per_object:
                 most = self.upper.new_tensor(_UPRIGHT_LIMITS.get(parameter, math.inf))
+                most = most[: specs[parameter].size] if parameter is Parameter.COLOR else most
                 upright = scene.objects.upright
                 for bound in (self.lower, self.upper):
                     block = bound[where].view(self.count, specs[parameter].size)
                     block[behind_camera(scene)] = 0
                     block[upright] = block[upright].clamp(-most, most)
+                    if parameter is Parameter.COLOR:
+                        block[~scene.objects.parted, TEXTURE_DIM:] = 0
 
     def unflatten(self, theta: Tensor) -> Perturbation:
         """theta (D,) as named tensors (views of it). Raises ShapeError."""

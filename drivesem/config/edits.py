@@ -33,7 +33,7 @@ from typing import Any
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
 from scene_ir.ffd import SYMMETRIC_DIM
-from scene_ir.types import TEXTURE_DIM, Weather
+from scene_ir.types import CLOTHES_DIM, TEXTURE_DIM, Weather
 
 ALL = "all"
 WEATHER_CODES = tuple(code.name.lower() for code in Weather)
@@ -73,7 +73,7 @@ class ObjectEdit:
     rotate: float = 0.0
     """Turn about the ground centre, rad."""
     color: tuple[float, ...] = (0.0,) * TEXTURE_DIM
-    """The texture code (5,), in [-1, 1]."""
+    """The texture code (5,), or (8,) of a pedestrian, in [-1, 1]."""
     mesh: tuple[float, ...] = ()
     """Independent lattice offsets (96,), or none."""
     size: float = 0.0
@@ -86,8 +86,9 @@ class ObjectEdit:
     """Code of the lamps, in [-1, 1]."""
 
     def __post_init__(self) -> None:
-        if len(self.color) != TEXTURE_DIM or not all(-1 <= c <= 1 for c in self.color):
-            raise RangeError("edit color", f"{TEXTURE_DIM} codes in [-1, 1]", list(self.color))
+        if len(self.color) not in (TEXTURE_DIM, CLOTHES_DIM) or not all(-1 <= c <= 1 for c in self.color):
+            expected = f"{TEXTURE_DIM} codes in [-1, 1], or {CLOTHES_DIM} for a pedestrian"
+            raise RangeError("edit color", expected, list(self.color))
         if len(self.mesh) not in (0, SYMMETRIC_DIM):
             raise RangeError("edit mesh", f"{SYMMETRIC_DIM} lattice offsets", len(self.mesh))
         if not -1 <= self.lamps <= 1:
@@ -236,7 +237,7 @@ def _object_edit(where: str, value: Any) -> ObjectEdit:
             translate=(own[0], own[1]),
             translate_m=(metres[0], metres[1]),
             rotate=_angle(f"{where}: rotate", entry.get("rotate", 0)),
-            color=_floats(f"{where}: color", entry.get("color", [0] * TEXTURE_DIM), TEXTURE_DIM),
+            color=_floats(f"{where}: color", entry.get("color", [0] * TEXTURE_DIM), TEXTURE_DIM, CLOTHES_DIM),
             mesh=() if mesh in (None, []) else _floats(f"{where}: mesh", mesh, SYMMETRIC_DIM),
             size=_fraction(f"{where}: size", entry.get("size", 0)),
             remove=remove,
@@ -276,14 +277,14 @@ def require_mapping(where: str, value: Any, known: Sequence[str] | None = None) 
     return value
 
 
-def _list(where: str, value: Any, length: int) -> Sequence[Any]:
-    if not isinstance(value, list | tuple) or len(value) != length:
-        raise FormatError(where, f"a list of {length}", repr(value))
+def _list(where: str, value: Any, *lengths: int) -> Sequence[Any]:
+    if not isinstance(value, list | tuple) or len(value) not in lengths:
+        raise FormatError(where, f"a list of {' or '.join(map(str, lengths))}", repr(value))
     return value
 
 
-def _floats(where: str, value: Any, length: int) -> tuple[float, ...]:
-    return tuple(parse_finite_number(where, item) for item in _list(where, value, length))
+def _floats(where: str, value: Any, *lengths: int) -> tuple[float, ...]:
+    return tuple(parse_finite_number(where, item) for item in _list(where, value, *lengths))
 
 
 def parse_finite_number(where: str, value: Any) -> float:

@@ -196,7 +196,7 @@ class NuisanceSample:
     size: Tensor
     """(N,) relative changes of size."""
     paint: Tensor
-    """(N, 5) changes of texture codes."""
+    """(N, 5) changes of texture codes; clothes above and below the waist change alike."""
     weather: Tensor
     """(5,) changes of the weather code."""
     foliage: Tensor
@@ -211,8 +211,10 @@ class NuisanceSample:
         moved = objects.translation + (self.position_m.to(axes)[:, :, None] * axes).sum(dim=1)
         yaw = objects.yaw + self.angle.to(axes)
         grown = objects.ffd + self.size.to(axes)[:, None, None] * _LATTICE_POINTS.to(axes)
+        code = objects.texture_code
+        paint = torch.cat([self.paint, self.paint[:, :3]], dim=1)[:, : code.shape[1]]
         return scene.with_objects(
-            translation=moved, yaw=yaw, ffd=grown, texture_code=_perturb_code(objects.texture_code, self.paint, -1)
+            translation=moved, yaw=yaw, ffd=grown, texture_code=_perturb_code(code, paint, -1)
         ).with_environment(
             weather=_perturb_code(environment.weather, self.weather, 0),
             foliage=_perturb_code(environment.foliage, self.foliage, -1),

@@ -32,7 +32,7 @@ from scene_ir.ffd import from_symmetric
 from scene_ir.render.environment import low_sun_share, move_sun, time_gain
 from scene_ir.render.model import FOG_EXTINCTION_PER_M, RAIN_EXTINCTION_PER_M, SUN_STRENGTH, TWILIGHT_SKY
 from scene_ir.render.texture import apply_texture_code
-from scene_ir.types import Weather
+from scene_ir.types import TEXTURE_DIM, Weather
 
 __all__ = ["ALL", "Edits", "FrameEdit", "ObjectEdit", "apply_edit", "apply_edits", "draw_night", "read_edits"]
 
@@ -108,6 +108,9 @@ def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
     if edit.mesh_fraction:
         expected = "lattice offsets; a generated vehicle has no other shape to take a share of"
         raise RangeError(f"object {actor.track}: mesh", expected, f"{edit.mesh_fraction:.0%}")
+    if any(edit.color[TEXTURE_DIM:]):
+        expected = f"{TEXTURE_DIM} codes; clothes of generated people are as generated"
+        raise RangeError(f"object {actor.track}: color", expected, f"{len(edit.color)} codes")
     length = actor.size_lhw[0]
     along, across = (a * length + b for a, b in zip(edit.translate, edit.translate_m, strict=True))
     cos, sin = math.cos(actor.yaw), math.sin(actor.yaw)
@@ -122,7 +125,7 @@ def _edited(actor: Actor, edit: ObjectEdit) -> Actor | None:
         actor,
         position_xz=(x + along * cos + across * sin, z - along * sin + across * cos),
         yaw=(actor.yaw + edit.rotate + math.pi) % (2 * math.pi) - math.pi,
-        paint=_painted(actor.paint, edit.color),
+        paint=_painted(actor.paint, edit.color[:TEXTURE_DIM]),
         ffd=bent,
         size_lhw=(long, high, wide),
         lamps=max(-1.0, min(actor.lamps + edit.lamps, 1.0)),

@@ -65,7 +65,8 @@ class ClipSpace(ThetaSpace[Parameter]):
         self.tracks = tuple(sorted({track for of_frame in tracks for track in of_frame}))
         self.points = bend + 1
         like = spaces[0].scene.objects.translation
-        super().__init__(spaces[0].params, _specs(spaces[0].specs, self.points), len(self.tracks), like)
+        widest = max(spaces, key=lambda space: space.specs[Parameter.COLOR].size)  # a frame without objects has 5
+        super().__init__(spaces[0].params, _specs(widest.specs, self.points), len(self.tracks), like)
         places = ([self.tracks.index(track) for track in of_frame] for of_frame in tracks)
         self.rows = [torch.tensor(of_frame, dtype=torch.int64, device=like.device) for of_frame in places]
         self._weights = _path_weights(self.tracks, tracks, self.points, like, background_people)
@@ -91,6 +92,8 @@ class ClipSpace(ThetaSpace[Parameter]):
             assert block is not None
             if SPECS[parameter].per_object:
                 block = block[self.rows[frame]]
+            if parameter is Parameter.COLOR:
+                block = block[:, : self.spaces[frame].specs[parameter].size]
             if parameter is Parameter.TRANSLATE:
                 weights = self._weights[frame]
                 block = (weights[:, :, None] * block.reshape(len(block), self.points, 2)).sum(1)
@@ -124,7 +127,7 @@ class ClipSpace(ThetaSpace[Parameter]):
                 path = block.reshape(len(block), self.points, 2)
                 path[self.rows[frame]] *= 1 - matter[:, :, None] * (1 - share[:, None])
             elif SPECS[parameter].per_object:
-                block[self.rows[frame]] = there
+                block[self.rows[frame], : there.shape[1]] = there
             else:
                 block.copy_(there)
         return theta
@@ -167,7 +170,7 @@ class ClipSpace(ThetaSpace[Parameter]):
             if parameter is Parameter.TRANSLATE:
                 block[rows] = tighter(block[rows], _INSIDE * there.repeat(1, self.points))
             elif SPECS[parameter].per_object:
-                block[rows] = tighter(block[rows], there)
+                block[rows, : there.shape[1]] = tighter(block[rows, : there.shape[1]], there)
             else:
                 block.copy_(tighter(block, there))
         where, there = self.blocks.get(parameter), space.blocks.get(parameter)

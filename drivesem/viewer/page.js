@@ -9,7 +9,8 @@ const GROUPS = {translate: "Place", rotate: "Place", size: "Size and shape", sha
   weather: "Weather", foliage: "Leaves", sun: "Sun", lamps: "Lamps"};
 const ORDER = ["Place", "Colour", "Size and shape", "Lamps", "Weather", "Leaves", "Sun"];
 const MEANING = {along: "forwards, along its photographed heading", across: "to its own left", yaw: "about its ground centre",
-  a: "from green to red", b: "from blue to yellow", shape: "share of the shape that was found"};
+  a: "from green to red", b: "from blue to yellow", "lower lightness": "of clothes below the waist",
+  "lower a": "of clothes below the waist, from green to red", "lower b": "of clothes below the waist, from blue to yellow", shape: "share of the shape that was found"};
 const STATUS = {found: "found", lost: "lost", missed: "missed as photographed too", ignored: "not judged"};
 
 let overview = null, frame = null, values = new Map(), sliders = new Map(), widgets = new Map();

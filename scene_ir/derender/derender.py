@@ -37,6 +37,7 @@ from scene_ir.image_filters import channel_max
 from scene_ir.raster import verbs
 from scene_ir.render.sources import SolveSettings, solve_sources
 from scene_ir.types import (
+    CLOTHES_DIM,
     FOLIAGE_DIM,
     LATTICE_POINTS,
     TEXTURE_DIM,
@@ -203,7 +204,7 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
         depth_m = torch.where(torch.from_numpy(vehicles), depth_m, frame.depth.float())
 
     # The scene.
-    objects, meshes = _make_objects(labels, cuts)
+    objects, meshes = _make_objects(labels, cuts, CLOTHES_DIM if settings.people else TEXTURE_DIM)
     provenance = dict(frame.provenance) | {"frame": frame.identifier, "derender": "template fit and patch fill"}
     for index, cut in enumerate(cuts):
         provenance[f"objects[{index}].label"] = str(cut.row)
@@ -794,8 +795,8 @@ def _make_environment(
     )
 
 
-def _make_objects(labels: Labels, cuts: list[_VehicleCutout]) -> tuple[Objects, tuple[Mesh, ...]]:
-    """The vehicles at their placements, without sources, and their meshes."""
+def _make_objects(labels: Labels, cuts: list[_VehicleCutout], codes: int) -> tuple[Objects, tuple[Mesh, ...]]:
+    """The vehicles at their placements, without sources, with texture codes (N, codes) of 0, and their meshes."""
     meshes: dict[int, Mesh] = {}
     for cut in cuts:
         meshes.setdefault(id(cut.placement.mesh), cut.placement.mesh)
@@ -812,7 +813,7 @@ def _make_objects(labels: Labels, cuts: list[_VehicleCutout]) -> tuple[Objects, 
         stack("yaw"),
         stack("size_lhw", 3),
         stack("ffd", LATTICE_POINTS, 3),
-        torch.zeros(len(cuts), TEXTURE_DIM),
+        torch.zeros(len(cuts), codes),
         torch.tensor([int(_CATEGORIES[labels.kind[row]]) for row in rows], dtype=torch.int64),
         labels.boxes_xyxy[rows].float(),
         labels.truncation[rows].float(),

@@ -141,7 +141,7 @@ def cut_out_people(
         reach = _remove_specks(grow_mask(mask, _BORDER + 1) | (share > _TRACE)) & ~taken
         shares = _firm_up(shares, mask)
         pose = labels.translation[row], labels.yaw[row], labels.size_lhw[row]
-        placement = upright.make_placement(reach, labels.kind[row], pose, camera)
+        placement = upright.make_placement(reach, labels.kind[row], pose, camera, body=mask)
         cuts.append(PersonCutout(row, placement, mask, reach, shares))
         taken = taken | mask
     return cuts, {row: reason for row, reason in reasons.items() if reason}

@@ -90,6 +90,7 @@ def make_placement(
     pose: tuple[Tensor, Tensor, Tensor],
     camera: Camera,
     detail: OutlineDetail = UNDER_MATTE,
+    body: Mask | None = None,
 ) -> Placement:
     """The surface of one person or cyclist: upright, facing the camera through the labelled place, with the outline of
     a mask and a shallow relief.
@@ -100,6 +101,7 @@ def make_placement(
         pose: Labelled translation (3,) m, yaw () rad and size (3,) m; the object's frame.
         camera: The photograph's camera.
         detail: How closely the surface follows the mask.
+        body: Pixels (H, W) by which the heights of clothing are measured; those of the mask if None.
 
     Returns:
         The placed surface; its mesh is closed, and may reach beyond the unit box where the mask reaches beyond the
@@ -123,8 +125,10 @@ def make_placement(
     ]
     unit = (torch.cat(layers) - translation) @ yaw_matrix(yaw) / size_lhw
     faces = torch.from_numpy(grid.closed_faces())
-    height = grid.pixels[:, 1]
-    share = torch.from_numpy((height.max() - height) / max(np.ptp(height), 1.0)).repeat(2)[faces].mean(1)
+    rows = np.flatnonzero((mask if body is None else body).any(1))
+    share = (
+        torch.from_numpy((rows[-1] + 0.5 - grid.pixels[:, 1]) / (rows[-1] + 1 - rows[0])).repeat(2)[faces].mean(1)
+    )
     low, high = _CLOTHED[kind]
     part = torch.where((share > low) & (share < high), int(Part.PAINT), int(Part.OTHER))
     return place_mesh(Mesh(unit.float(), faces, part, kind.lower()), *pose)

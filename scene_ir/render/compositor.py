@@ -30,7 +30,7 @@ from scene_ir.render.night import apply_night, night_share
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
 from scene_ir.render.reflections import by_row, mirror_in_ground
 from scene_ir.render.spray import draw_spray
-from scene_ir.render.texture import PaintRegions
+from scene_ir.render.texture import PaintRegions, codes_by_part
 from scene_ir.render.windscreen import add_drops
 from scene_ir.types import Crop, Objects, Render, SceneIR, Weather, replace_unchecked
 
@@ -196,7 +196,7 @@ def _draw_layers(
     if any(is_active(o.texture_code) for o in objects):
         regions = [m.regions for m in members]
         code = fast.PaintCodes(
-            concat([o.texture_code for o in objects]),
+            concat([codes_by_part(o) for o in objects]),
             concat([m.paint_lightness for m in members]),
             PaintRegions.concat([r for r in regions if r is not None]),
         )
@@ -231,7 +231,7 @@ def render_batch(pairs: Sequence[tuple[Compositor, SceneIR]]) -> list[Render]:
     A compositor may occur several times. The pictures equal those of `Compositor.render`.
     """
     members = tuple(c for c, _ in pairs)
-    together = len(pairs) > 1 and all(
+    together = len({scene.objects.texture_code.shape[1:] for _, scene in pairs}) == 1 < len(pairs) and all(
         c.fixed_geometry is not None and (scene.before is None) == (c.scene.before is None) for c, scene in pairs
     )
     if not together:

@@ -122,7 +122,7 @@ class PaintCodes:
     """Texture codes, and what they change."""
 
     values: Tensor
-    """(N, 5)."""
+    """(N, 5) or (N, 8), see `texture.codes_by_part`."""
     lightness: Tensor
     """(N,) CIE L* of the objects' paint."""
     regions: texture.PaintRegions
@@ -163,9 +163,9 @@ def draw_photographed(
                     texels.values, texels.rects, texels.offsets, drawn.mesh.layout, uv, "warp", "zero"
                 )
                 paint = texture.paint_share(paint, region[:, 0], unseen, known)
-            colour = texture.apply_texture_code(
-                rgba[:, :3], rgba[:, 3], rows, paint, lookup[:, channels.HEIGHT], lightness, "warp"
-            )
+            height = lookup[:, channels.HEIGHT]
+            codes = texture.codes_at_height(rows, height)
+            colour = texture.apply_texture_code(rgba[:, :3], rgba[:, 3], codes, paint, height, lightness, "warp")
             return torch.cat([colour, rgba[:, 3:]], dim=1)
 
         return painted(mesh, lookup, fill), painted(halo, anchor, torch.zeros_like(fill))

@@ -4,7 +4,8 @@ A lamp is a sum of Gaussians that are separable along rows and columns: its imag
 in the air around it, a streak across. So all lamps of a picture are one matrix product, differentiable to poses,
 shapes and codes. Which lamps something hides comes from the z-buffer, without a slope.
 
-Shapes: N vehicles with 4 lamps each: front left, front right, rear left, rear right.
+Shapes: N objects with 4 lamps each: front left, front right, rear left, rear right. Of riders only the left ones are
+there, on the centre line; people on foot have none.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ class VehicleLamps:
     """(N,) in [0, 1]: 0 is parked, with all lamps off."""
     front: Tensor
     """(N, 4) bool, which are headlamps."""
+    radius_m: Tensor
+    """(N, 4), 0 where there is no lamp."""
 
 
 def lamps_on(weather: Tensor) -> Tensor:
@@ -63,17 +66,22 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
     like = centre
     meshes = [scene.meshes[int(i)] for i in base.mesh_index]
     unit = torch.stack([find_lamp_places(mesh) for mesh in meshes]).to(like)
+    riders = scene.riders
+    unit[riders] = _rider_lamp_places(base.size_lhw[riders].to(like))
     weights = ffd.lattice_weights(unit.reshape(-1, 3)).reshape(*unit.shape[:2], -1)
     driven = torch.stack([is_driven(scene, base, i) for i in range(len(base))]).to(like)
-    driven = driven * ~base.upright.to(driven.device)
+    driven = torch.where(base.upright, riders.to(driven), driven)
     front = torch.tensor([x > 0 for x, _ in _QUADRANTS]).repeat(len(base), 1)
-    still = VehicleLamps(unit, weights, torch.zeros_like(unit[..., :2]), driven, front)
+    left = torch.tensor([z > 0 for _, z in _QUADRANTS], device=like.device)
+    own = model.RIDER_LAMP_RADIUS_M * (riders[:, None] & left).to(like)
+    radius_m = torch.where(base.upright[:, None], own, model.LAMP_RADIUS_M)
+    still = VehicleLamps(unit, weights, torch.zeros_like(unit[..., :2]), driven, front, radius_m)
     xy, depth, facing = project_lamps(still, scene, base, centre)
     focal = scene.camera.matrix[0, 0].to(like)
     reach_px = model.LAMP_SEARCH * focal * base.size_lhw[:, 2:].to(like) / depth
     shift_px = torch.zeros_like(xy)
     seen = (facing > 0.2) & (depth > 0.5)
-    for i in range(len(base)) if base.source else ():
+    for i in (~base.upright).nonzero()[:, 0].tolist() if base.source else ():
         foreground = base.source[i].foreground
         reach = reach_px[i].clamp(min=_LEAST_SEARCH_PX).tolist()
         ahead = [k for k in (0, 1) if seen[i, k]]
@@ -81,7 +89,9 @@ def find_lamps(scene: SceneIR, base: Objects, centre: Tensor) -> VehicleLamps:
             front[i] = ~front[i]  # the estimated heading is turned by 180 degrees
         for k in seen[i].nonzero()[:, 0].tolist():
             shift_px[i, k] = _snap(foreground, xy[i, k], reach[k], bool(front[i, k]))
-    return VehicleLamps(unit, weights, shift_px * (depth / focal)[..., None], driven, front.to(like.device))
+    return VehicleLamps(
+        unit, weights, shift_px * (depth / focal)[..., None], driven, front.to(like.device), radius_m
+    )
 
 
 def find_lamp_places(mesh: Mesh) -> Tensor:
@@ -96,6 +106,13 @@ def find_lamp_places(mesh: Mesh) -> Tensor:
         found = float(weight.sum()) > 0
         places.append((centres * weight[:, None]).sum(dim=0) / weight.sum() if found else usual)
     return torch.stack(places)
+
+
+def _rider_lamp_places(size_lhw: Tensor) -> Tensor:
+    """Places (K, 4, 3) in the unit box of riders' lamps: on the centre line, where the upright surface stands."""
+    height_m = size_lhw.new_tensor([model.RIDER_LAMPS_M[x < 0] for x, _ in _QUADRANTS])
+    up = height_m / size_lhw[:, 1:2]
+    return torch.stack([torch.zeros_like(up), -up, torch.zeros_like(up)], dim=-1)
 
 
 def is_driven(scene: SceneIR, base: Objects, i: int) -> Tensor:
@@ -198,7 +215,7 @@ def draw_lamps(
     weather = environment.weather.to(centre)
     xy, depth, facing = project_lamps(lamps, scene, objects, centre)
     mirror_xy, *_ = project_lamps(lamps, scene, objects, centre, mirrored=True)
-    seen = _visible_share(number, xy.detach(), depth.detach())
+    seen = _visible_share(number, xy.detach(), depth.detach()) * (lamps.radius_m > 0)
     coded = objects.lamps.requires_grad or bool((objects.lamps != 0).any())
     may_shine = (lamps.driven > 0) | coded
     index = ((seen > 0) & (facing.detach() > 0) & may_shine[:, None]).reshape(-1).nonzero()[:, 0]
@@ -220,7 +237,7 @@ def draw_lamps(
     strength = exposure * level.clamp(min=0.0) * seen * smoothstep(facing, *model.LAMP_FACES)
     strength = strength * beam * torch.exp(-extinction * depth)
     colours = centre.new_tensor([model.TAIL_LAMP_RGB, model.HEADLAMP_RGB])[front.long()] * strength[:, None]
-    radius = model.LAMP_RADIUS_M * scene.camera.matrix[0, 0].to(depth) / depth
+    radius = lamps.radius_m.reshape(-1)[index] * scene.camera.matrix[0, 0].to(depth) / depth
     # An image below a pixel spreads over it.
     core = (radius.square() + model.LAMP_LEAST_PX**2).sqrt()
     area = radius.square()

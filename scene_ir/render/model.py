@@ -134,6 +134,9 @@ CLEAN_ROOF = 0.75
 """Share of the dust that does not stick to the roof."""
 DUST_RGB = (0.47, 0.42, 0.35)
 """Dry road dust."""
+WAIST = (0.51, 0.55)
+"""Shares of a person's height between which the codes of the clothes below and above the waist blend: about the hip
+joint, at 0.53 (Drillis and Contini 1966, in Winter, Biomechanics and Motor Control of Human Movement, figure 4.1)."""
 LEVEL = (0.01, 0.99)
 """Bounds of L* / 100 before its logit is taken."""
 GAMUT_SHARPNESS = 20.0
@@ -337,6 +340,9 @@ LAMPS_ON = (1.6, 1.2, 1.6, 0.3, 3.0, 1.2)
 """Rates at which fog, rain, time, overcast, night and snow make drivers switch on their lamps."""
 TAIL_LAMP_RGB, HEADLAMP_RGB = (3.2, 0.12, 0.08), (8.0, 7.2, 6.0)
 """Light of a lamp that faces the camera by night; white is 1."""
+RIDER_LAMPS_M, RIDER_LAMP_RADIUS_M = (0.9, 0.6), 0.03
+"""Heights of a bicycle's or motorcycle's lamps, front and rear (StVZO section 67 has 0.4 to 1.2 m and 0.25 to 1.2 m),
+and their radius, like that of a vehicle's."""
 TAIL_CORE = 0.25
 """Share of its red that the sensor shows as white in the middle of a tail lamp, where it overflows."""
 LAMP_STRETCH = (1.5, 0.7)

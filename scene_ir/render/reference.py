@@ -124,7 +124,11 @@ def draw_layers(
         )
     colour, depth = shaded.colour, shaded.depth
     if is_active(objects.texture_code):
-        code, base = objects.texture_code.index_select(0, rows.owner), prepared.paint_lightness[rows.owner]
+        code, base = (
+            texture.codes_by_part(objects).index_select(0, rows.owner),
+            prepared.paint_lightness[rows.owner],
+        )
+        code = texture.codes_at_height(code, shaded.height)
         colour = texture.apply_texture_code(colour, shaded.opacity, code, shaded.paint, shaded.height, base)
     opacity = shaded.opacity * rows.share
     inverse = (opacity / depth.clamp(min=verbs.NEAR_M))[:, None]

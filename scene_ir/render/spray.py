@@ -81,7 +81,7 @@ def _project_spray(objects: Objects, lamps: VehicleLamps, camera: Camera) -> tup
     spread = slopes @ (axes.transpose(1, 2) * deviation[:, None])
     rays = torch.cat([place[:, :2], torch.ones_like(place[:, :1])], dim=1) @ torch.linalg.inv(matrix[:, :3]).T
     density = model.SPRAY_PER_M * rays.norm(dim=1) * smoothstep(depth, *model.SPRAY_NEAR_M)
-    return place, spread @ spread.transpose(1, 2), density * lamps.driven.to(density)
+    return place, spread @ spread.transpose(1, 2), density * lamps.driven.to(density) * ~objects.upright
 
 
 def _optical_depth(inverse_depth: Tensor, row: Tensor, x0: int, y0: int) -> Tensor:

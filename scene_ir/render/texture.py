@@ -18,7 +18,7 @@ from scene_ir.geometry import clamp_inclusive
 from scene_ir.raster import verbs
 from scene_ir.render import model
 from scene_ir.render.surfaces import nearest_true_pixel
-from scene_ir.types import Crop, Source
+from scene_ir.types import TEXTURE_DIM, Crop, Objects, Source
 
 _PAD = 2
 """Texels around a crop that complete the 4x4 Catmull-Rom footprint at its edge."""
@@ -287,6 +287,29 @@ def inside_weight(uv: Tensor, height: int, width: int, fade_px: tuple[float, flo
     limit = uv.new_tensor([width - 1.0, height - 1.0])
     beyond = torch.maximum(-uv, uv - limit)
     return (1.0 - smoothstep(beyond, *fade_px)).prod(dim=-1)
+
+
+def codes_by_part(objects: Objects) -> Tensor:
+    """Texture codes (N, 5), or (N, 8) in which an object without a waist has its tint below it too."""
+    code = objects.texture_code
+    if code.shape[1] == TEXTURE_DIM:
+        return code
+    lower = torch.where(objects.parted[:, None], code[:, TEXTURE_DIM:], code[:, :3])
+    return torch.cat([code[:, :TEXTURE_DIM], lower], dim=1)
+
+
+def codes_at_height(code: Tensor, height: Tensor) -> Tensor:
+    """Texture codes (R, 5) of places on objects.
+
+    Args:
+        code: (R, 5) or (R, 8), see `codes_by_part`.
+        height: (R,) 0 at the object's foot, 1 at its top.
+    """
+    if code.shape[1] == TEXTURE_DIM:
+        return code
+    upper, rest, lower = code.split([3, TEXTURE_DIM - 3, 3], dim=1)
+    below = 1.0 - smoothstep(height, *model.WAIST)
+    return torch.cat([upper + below[:, None] * (lower - upper), rest], dim=1)
 
 
 def apply_texture_code(

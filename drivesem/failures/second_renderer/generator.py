@@ -36,7 +36,7 @@ from drivesem.synth.write import Order, list_jobs, plan_job
 from scene_ir import ffd, files
 from scene_ir.derender.derender import VEHICLE_CATEGORIES
 from scene_ir.errors import FormatError
-from scene_ir.types import LATTICE, SceneIR
+from scene_ir.types import LATTICE, TEXTURE_DIM, SceneIR
 
 _GENERATED_RUN = "a run on generated frames: the embedded scenes, or drivesem synth --layout kitti"
 _EXTERNAL_FILES = ("edits", "meshes", "assets")
@@ -183,7 +183,7 @@ def transfer_edit(still: SceneIR, changed: SceneIR, planned: PlanMatch) -> Trans
         edits[track] = ObjectEdit(
             translate_m=_along_and_across(move, actor, view),
             rotate=turn,
-            color=tuple(paint.clamp(-1, 1).tolist()),
+            color=tuple(paint[:TEXTURE_DIM].clamp(-1, 1).tolist()),
             mesh=tuple(ffd.to_symmetric(bend).tolist()) if bool(bend.any()) else (),
             size=grown,
             lamps=max(-1.0, min(lamps, 1.0)),

@@ -42,6 +42,10 @@ _TOWN, _TOWN_GLOW = np.array([0.012, 0.010, 0.008], np.float32), np.array([0.006
 """Light that a town casts from all sides, and that of its sky."""
 _LAMPS_LIT = np.array([1.5, 1.2, 1.5, 0.3, 3.0, 1.2], np.float32)
 """How much fog, rain, time, overcast and night make drivers switch on their lamps."""
+_LAMP_PLACES = ((0.48, -0.5, 0.38), (0.48, -0.5, -0.38), (-0.48, -0.5, 0.38), (-0.48, -0.5, -0.38))
+"""Usual places of a vehicle's lamps in its box."""
+_RIDER_LAMPS_M, _RIDER_LAMP_M = np.array([[0.0, -0.9, 0.0], [0.0, -0.6, 0.0]], np.float32), 0.025
+"""Places of a two-wheeler's lamps, front and rear, within what StVZO section 67 allows, and their width."""
 _TAIL, _HEAD = np.array([2.0, 0.1, 0.05], np.float32), np.array([6.0, 5.5, 4.5], np.float32)
 """Light of a vehicle's lamps by night; white is 1."""
 _LAMP_M, _LAMP_BY_DAY, _BRAKING = 0.06, 0.15, 2.5
@@ -77,6 +81,7 @@ def apply_night(
     camera: PictureCamera,
     poses: Sequence[VehiclePose],
     codes: Array,
+    riders: NDArray[np.bool_] | None = None,
 ) -> Array:
     """Apply the environment's night, and switch on the vehicles' lamps as its weather makes drivers do.
 
@@ -88,6 +93,7 @@ def apply_night(
         camera: Camera.
         poses: Poses of the vehicles.
         codes: (N,) codes of their lamps.
+        riders: (N,) which have one lamp at either end of a two-wheeler; none if None.
 
     Returns:
         (H, W, 3) RGB, at least 0.
@@ -109,11 +115,22 @@ def apply_night(
     mirrored = np.zeros_like(light)
     for i, pose in enumerate(poses):
         code = float(codes[i])
-        on = driven * (1 + min(code, 0)) * _stands_in_traffic(pose, environment, camera)
+        rides = riders is not None and bool(riders[i])
+        on = driven * (1 + min(code, 0)) * (rides or _stands_in_traffic(pose, environment, camera))
         levels = exposure * (on + np.array([0, _BRAKING * max(code, 0)]))
         if levels.any():
+            places = _RIDER_LAMPS_M if rides else np.array(_LAMP_PLACES, np.float32) * pose.size_lhw
             _draw_lamps(
-                lamps, mirrored, owner == i + 1, pose, camera, to_numpy(environment.ground), extinction, levels
+                lamps,
+                mirrored,
+                owner == i + 1,
+                pose,
+                places,
+                _RIDER_LAMP_M if rides else _LAMP_M,
+                camera,
+                to_numpy(environment.ground),
+                extinction,
+                levels,
             )
     if not (night or lamps.any()):
         return image
@@ -231,35 +248,41 @@ def _draw_lamps(
     mirrored: Array,
     seen: NDArray[np.bool_],
     pose: VehiclePose,
+    places: Array,
+    radius_m: float,
     camera: PictureCamera,
     ground: Array,
     extinction: float,
     levels: Floats,
 ) -> None:
-    """Add the light of a vehicle's visible lamps, at usual places of its box, and their images on a wet road.
+    """Add the light of a vehicle's visible lamps and their images on a wet road.
 
     Args:
         lamps: (H, W, 3) light, changed in place.
         mirrored: (H, W, 3) light of the images, changed in place.
         seen: (H, W) where the vehicle is seen.
         pose: Its pose.
+        places: (K, 3) m, of its lamps in its own axes, the first half in front.
+        radius_m: Of each.
         camera: Camera.
         ground: (4,) plane of the ground.
         extinction: Of the air, per m.
         levels: (2,) front and rear.
     """
-    for along, across in ((0.48, 0.38), (0.48, -0.38), (-0.48, 0.38), (-0.48, -0.38)):
-        local = np.array([along, -0.5, across], np.float32) * pose.size_lhw
+    for k, local in enumerate(places):
+        front = 2 * k < len(places)
         place = pose.rotation() @ local + pose.translation + camera.shift_m
-        facing = float(pose.rotation()[:, 0] @ -place) * np.sign(along) / max(float(np.linalg.norm(place)), 1e-6)
+        facing = (
+            float(pose.rotation()[:, 0] @ -place) * (1 if front else -1) / max(float(np.linalg.norm(place)), 1e-6)
+        )
         if place[2] < 1 or facing <= 0:
             continue
         x, y = (round(float(v)) for v in camera.project(place.astype(np.float32)))
         if not seen[max(y - 2, 0) : max(y + 3, 0), max(x - 2, 0) : max(x + 3, 0)].any():
             continue
-        colour = levels[0] * _HEAD * facing**4 if along > 0 else levels[1] * _TAIL * min(2 * facing, 1)
+        colour = levels[0] * _HEAD * facing**4 if front else levels[1] * _TAIL * min(2 * facing, 1)
         colour = colour * np.exp(-extinction * place[2])
-        _draw_spot(lamps, place, _LAMP_M, camera, colour, seen)
+        _draw_spot(lamps, place, radius_m, camera, colour, seen)
         below = place - 2 * float(place @ ground[:3] + ground[3] - camera.shift_m @ ground[:3]) * ground[:3]
         _draw_streak(mirrored, place, below.astype(np.float32), camera, colour)
 

@@ -34,7 +34,7 @@ from drivesem.failures.second_renderer.opengl import (
 )
 from drivesem.failures.second_renderer.shading import GroundShadow
 from scene_ir.errors import RangeError
-from scene_ir.types import Crop, Occluder, Render, SceneIR, Source
+from scene_ir.types import Crop, Objects, Occluder, Render, SceneIR, Source
 
 _MIN_SHARE = 0.5
 """Minimum coverage of a pixel that shows an object; minimum visible share of an object, relative to the
@@ -125,13 +125,18 @@ class PhotographRenderer:
     def textured_vehicles(self, changed: SceneIR) -> list[tuple[Array, TexturedSurface]]:
         """The vehicles of a state: triangles (F, 3, 3) m in the camera's own axes, and their textures."""
         poses = [VehiclePose.from_objects(changed.objects, i) for i in range(len(changed.objects))]
-        codes = to_numpy(changed.objects.texture_code)
+        surfaces = self._surfaces(changed.objects)
         return [
-            (
-                vehicle.body.place(pose, self._camera),
-                TexturedSurface(vehicle.atlas.uv, _paint_texture(vehicle, code)),
-            )
-            for vehicle, pose, code in zip(self._vehicles, poses, codes, strict=True)
+            (vehicle.body.place(pose, self._camera), surface)
+            for vehicle, pose, surface in zip(self._vehicles, poses, surfaces, strict=True)
+        ]
+
+    def _surfaces(self, objects: Objects) -> list[TexturedSurface]:
+        codes, parted = to_numpy(objects.texture_code), objects.parted.tolist()
+        codes = [code if lower else code[:5] for code, lower in zip(codes, parted, strict=True)]
+        return [
+            TexturedSurface(v.atlas.uv, _paint_texture(v, code))
+            for v, code in zip(self._vehicles, codes, strict=True)
         ]
 
     def _make_vehicle(self, source: Source, i: int) -> _Vehicle:
@@ -199,13 +204,8 @@ class PhotographRenderer:
         depth_m, owner = self._depth_m.copy(), np.zeros(image.shape[:2], np.int64)
         window = _enclosing_window(placed, camera)
         if window is not None:
-            codes = to_numpy(objects.texture_code)
-            surfaces = [
-                TexturedSurface(v.atlas.uv, _paint_texture(v, code))
-                for v, code in zip(self._vehicles, codes, strict=True)
-            ]
             rendered = self._context.render(
-                [p.reshape(-1, 3) for p in placed], surfaces, camera.intrinsics, window
+                [p.reshape(-1, 3) for p in placed], self._surfaces(objects), camera.intrinsics, window
             )
             owner[window.slices] = _pixel_owners(rendered, len(placed))
             _composite(
@@ -216,8 +216,10 @@ class PhotographRenderer:
                 self._occluder_layers(window),
             )
         image = shading.apply_weather(image, depth_m, (owner == 0).astype(np.float32), environment, self._air)
-        lamps = np.where(objects.upright.cpu().numpy(), -1.0, to_numpy(objects.lamps))  # people have none
-        image = apply_night(image, depth_m, owner, environment, camera, poses, lamps)
+        riders = self._still.riders.cpu().numpy()
+        unlit = objects.upright.cpu().numpy() & ~riders
+        lamps = np.where(unlit, -1.0, to_numpy(objects.lamps))
+        image = apply_night(image, depth_m, owner, environment, camera, poses, lamps, riders)
         if environment.ego is not None:
             inside = darken_inside(self._photograph, environment)
             image = image + (inside - image) * to_numpy(environment.ego)[..., None]

@@ -26,6 +26,8 @@ paint's own; opacity of dust at the foot."""
 _DUST = np.array([0.47, 0.42, 0.35], np.float32)
 _DUSTLESS = 0.75
 """Share of the dust that is missing at the roof."""
+_WAIST = (0.51, 0.55)
+"""Shares of a person's height between which codes of clothes blend: the hip joint (Drillis and Contini)."""
 
 _FOG_PER_M, _RAIN_PER_M, _SNOW_PER_M = 0.03, 0.002, 0.0025
 _LAYER_M = 300.0
@@ -51,7 +53,7 @@ def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: A
 
     Args:
         colour: (h, w, 3) RGB in [0, 1].
-        code: (5,) texture code.
+        code: (5,) texture code, or (8,) with that of clothes below the waist.
         paint: (h, w) in [0, 1], see `TextureAtlas.paint_share`.
         height: (h, w) in [0, 1], see `TextureAtlas.height`.
         base: (3,) paint's own colour.
@@ -63,7 +65,12 @@ def apply_paint(colour: Array, code: Array, paint: Array, height: Array, base: A
         return colour
     rows, columns = np.nonzero(paint > 0)
     here = colour[rows, columns]
-    lightness, red, yellow, gloss, dirt = (float(c) for c in code)
+    lightness, red, yellow, gloss, dirt, *lower = (float(c) for c in code)
+    if lower:
+        below = np.clip((_WAIST[1] - height[rows, columns]) / (_WAIST[1] - _WAIST[0]), 0, 1)
+        lightness, red, yellow = (
+            up + below * (low - up) for up, low in zip((lightness, red, yellow), lower, strict=True)
+        )
     lab = cv2.cvtColor(here[None], cv2.COLOR_RGB2LAB)[0]
     own = float(cv2.cvtColor(base.reshape(1, 1, 3), cv2.COLOR_RGB2LAB)[0, 0, 0])
     level = np.clip(lab[:, 0] / 100, 0.01, 0.99)

@@ -1,7 +1,9 @@
 """How far people and cyclists may move, by the parameter space, the projection and the independent check."""
 
 import math
+import shlex
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,10 +11,15 @@ import torch
 from drivesem.attacks.budgets import PRESETS, change_limits, parse_budget
 from drivesem.attacks.feasibility_check import check_scene
 from drivesem.attacks.feasible.projection import FeasibleSet
+from drivesem.attacks.scene_edits import apply_changes
 from drivesem.attacks.space import ParameterSpace
 from drivesem.config.commands import AttackConfig
+from drivesem.config.edits import merge_edits, parse_frame_edit, parse_setting
 from drivesem.config.options import SceneOptions
-from scene_ir.types import Category, SceneIR
+from drivesem.failures.nuisances import Nuisances
+from drivesem.viewer.sliders import SceneSliders
+from scene_ir.errors import RangeError
+from scene_ir.types import CLOTHES_DIM, Category, Crop, SceneIR, Source
 
 STREET = PRESETS["street"]
 LIMITS = change_limits(STREET)
@@ -63,6 +70,75 @@ def test_people_hardly_turn_and_grow_and_have_no_lattice_and_no_lamps(walk):
         assert person.tolist() == pytest.approx(most)
         assert torch.equal(space.lower.reshape(2, -1)[0], -person)
         assert bool((car > person).all())
+
+
+def with_parts(scene: SceneIR, category: Category = Category.PEDESTRIAN) -> SceneIR:
+    """The scene with codes of their own for clothes below the waist, and its person of a category."""
+    categories = torch.tensor([int(category), int(Category.CAR)])
+    return scene.with_objects(texture_code=torch.zeros(2, CLOTHES_DIM), category=categories)
+
+
+@pytest.mark.parametrize(
+    ("category", "lower"), [(Category.PEDESTRIAN, 0.5), (Category.CYCLIST, 0.0), (Category.TRUCK, 0.0)]
+)
+def test_only_clothes_of_pedestrians_change_below_the_waist(walk, category, lower):
+    scene = with_parts(walk, category)
+    space = ParameterSpace(scene, ("color",), STREET)
+    assert space.upper.reshape(2, 8)[:, 5:].tolist() == [[lower] * 3, [0.0] * 3]
+    assert space.name(5) == "objects[0].paint.lower_lightness"
+    widest = space.apply(scene, space.upper)
+    assert check_scene(scene, widest, "outlines", limits=LIMITS) == []
+    for row, parts in ((0, lower > 0), (1, False)):
+        code = torch.zeros(2, 8)
+        code[row, 6] = 0.4
+        found = check_scene(scene, scene.with_objects(texture_code=code), "outlines", limits=LIMITS)
+        assert (found == []) == parts
+        code[row, 6] = 0.6
+        found = check_scene(scene, scene.with_objects(texture_code=code), "outlines", limits=LIMITS)
+        assert any(f"objects[{row}]: " in line and "recoloured" in line for line in found)
+
+
+def test_sliders_and_their_commands_colour_both_parts(walk):
+    scene = with_parts(walk)
+    poses = zip(*(getattr(scene.objects, name) for name in ("translation", "yaw", "size_lhw", "ffd")), strict=True)
+    empty = Crop(torch.zeros(4, 0, 0), 0, 0)
+    sources = tuple(Source(*pose, empty, None, 0.0, torch.zeros(3), 1.0) for pose in poses)
+    sliders = SceneSliders(replace(scene, objects=replace(scene.objects, source=sources)), STREET)
+    lower = [name for name in sliders.sliders if ".lower_" in name]
+    assert lower == [f"objects[0].paint.lower_{n}" for n in ("lightness", "a", "b")]
+    assert sliders.sliders[lower[0]].title == "lower lightness"
+    state = {lower[1]: 0.25, "objects[1].paint.a": 0.5}
+    person, car = [w for w in shlex.split(sliders.command(Path("s"), state)) if w.startswith("objects")]
+    assert person == "objects[0].color=0,0,0,0,0,0,0.25,0"
+    edits = merge_edits(parse_setting(person), parse_setting(car))
+    found = apply_changes(scene, parse_frame_edit("edit", edits))
+    assert torch.equal(found.objects.texture_code, sliders.apply(state).objects.texture_code)
+
+
+def test_edits_of_clothes_are_alike_or_apart(walk):
+    scene = with_parts(walk)
+
+    def edited(color: str, row: int = 0, scene: SceneIR = scene) -> list[float]:
+        edit = parse_frame_edit("edit", parse_setting(f"objects[{row}].color={color}"))
+        return apply_changes(scene, edit).objects.texture_code[row].tolist()
+
+    assert edited("0.5,0,0.25,0,0") == [0.5, 0.0, 0.25, 0.0, 0.0, 0.5, 0.0, 0.25]
+    assert edited("0.5,0,0,0,0,0,0,0.25") == [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.25]
+    assert edited("0.5,0,0,0,0", 1) == [0.5, *[0.0] * 7]
+    assert edited("0.5,0,0,0,0", 0, walk) == [0.5, *[0.0] * 4]
+    for row, other in ((1, scene), (0, walk)):
+        with pytest.raises(RangeError, match=rf"objects\[{row}\].color: expected 5 codes; .* found 8 codes"):
+            edited("0.5,0,0,0,0,0,0,0.25", row, other)
+
+
+def test_clothes_vary_alike_from_sample_to_sample(walk):
+    scene = with_parts(walk)
+    code = torch.zeros(2, 8)
+    code[0, [0, 5]] = 0.25
+    scene = scene.with_objects(texture_code=code)
+    found = Nuisances().sample("clothes", 0, scene).perturb_scene(scene).objects.texture_code
+    assert float(found[0, 0]) == float(found[0, 5]) != 0.25
+    assert bool((found[code == 0] == 0).all())
 
 
 @pytest.mark.parametrize(("along", "across", "blocked"), [(1.0, 0.0, False), (0.0, 2.0, True), (0.0, -2.0, True)])

@@ -12,7 +12,7 @@ from drivesem.attacks.space import Budget, Parameter, ParameterSpace
 from drivesem.video.clips import DerenderedClip
 from drivesem.video.objective import ClipSpace, project_clip
 from drivesem.video.report import MissedInterval, TrackResult
-from scene_ir.types import SceneIR
+from scene_ir.types import Category, SceneIR
 from tests.drivesem.video.clips import clip_of
 
 PARAMS = ("color", "weather", "translate", "rotate", "mesh")
@@ -47,6 +47,27 @@ def test_what_is_a_cars_is_the_same_in_all_frames(space: ClipSpace, streets: Der
         weather = one.block(space.frame_theta(theta, frame), Parameter.WEATHER)
         assert weather is not None
         assert torch.equal(weather, theta[space.blocks[Parameter.WEATHER]])
+
+
+def test_frames_with_and_without_people_share_a_colour(streets: DerenderedClip) -> None:
+    """A frame without objects, read from a file, has five codes."""
+    scenes = list(streets.scenes)
+    for frame in (1, 2, 3):
+        count = len(scenes[frame].objects)
+        kinds = torch.tensor([int(Category.PEDESTRIAN), *[int(Category.CAR)] * (count - 1)])
+        scenes[frame] = scenes[frame].with_objects(texture_code=torch.zeros(count, 8), category=kinds)
+    space = ClipSpace([ParameterSpace(scene, ("color", "weather")) for scene in scenes], streets.tracks)
+    theta = random_theta(space)
+    block = space.block(theta, Parameter.COLOR)
+    assert block is not None
+    assert block.shape[1] == 8
+    for frame, width in enumerate((5, 8, 8, 8)):
+        colour = space.spaces[frame].block(space.frame_theta(theta, frame), Parameter.COLOR)
+        assert colour is not None
+        assert torch.equal(colour, block[space.rows[frame], :width])
+    projected = project_clip(space, [FeasibleSet(one) for one in space.spaces], theta)
+    assert projected.active, "weather that every frame limits"
+    assert torch.equal(projected.theta[space.blocks[Parameter.COLOR]], block.flatten())
 
 
 def test_theta_0_is_the_clip_as_it_was(space: ClipSpace, streets: DerenderedClip) -> None:

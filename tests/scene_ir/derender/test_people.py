@@ -10,7 +10,7 @@ import torch
 from drivesem.attacks.labels import hidden_shares
 from scene_ir.derender import people, upright
 from scene_ir.derender.derender import DerenderSettings, derender
-from scene_ir.derender.silhouette import render_silhouettes
+from scene_ir.derender.silhouette import grow_mask, render_silhouettes
 from scene_ir.errors import RangeError
 from scene_ir.exchange import CHANGE_KEY, relocate_person
 from scene_ir.geometry import project
@@ -130,6 +130,77 @@ def test_clothes_change_colour_and_the_head_does_not(crossing, scene):
     assert float(change[:, torch.from_numpy(person & head)].mean()) < 0.003
 
 
+def recolour(scene: SceneIR, **codes: list[float]) -> SceneIR:
+    """The scene with codes of its person's clothes: upper, lower."""
+    code = scene.objects.texture_code.clone()
+    for name, values in codes.items():
+        code[1, {"upper": slice(0, 3), "lower": slice(5, 8)}[name]] = torch.tensor(values).to(code)
+    return scene.with_objects(texture_code=code)
+
+
+@pytest.mark.parametrize("backend", ["warp", "reference"])
+def test_clothes_above_and_below_the_waist_change_apart(crossing, scene, backend):
+    compositor = Compositor(scene, RenderSettings(backend))
+    waist = [88 + FOCAL * (1.65 - share * 1.75) / 9 for share in (0.57, 0.49)]
+    rows = np.arange(crossing.masks.shape[1])
+    still = compositor.render(scene).image
+    for part, elsewhere in (("upper", rows > waist[1]), ("lower", rows < waist[0])):
+        image = compositor.render(recolour(scene, **{part: [0.5, 0.5, -0.5]})).image
+        change = (image - still).abs().amax(dim=0)
+        assert float(change.max()) > 0.1
+        assert float(change[torch.from_numpy(elsewhere)].max()) == 0
+    both = compositor.render(recolour(scene, upper=[0.3, 0.2, -0.4], lower=[0.3, 0.2, -0.4])).image
+    old = scene.with_objects(texture_code=scene.objects.texture_code[:, :5])
+    alike = Compositor(old, RenderSettings(backend)).render(
+        old.with_objects(texture_code=torch.tensor([[0.0] * 5, [0.3, 0.2, -0.4, 0.0, 0.0]]))
+    )
+    assert torch.equal(both, alike.image), "five codes change all clothes alike"
+
+
+@pytest.mark.parametrize("category", [Category.CAR, Category.CYCLIST])
+def test_only_pedestrians_have_clothes_of_two_parts(scene, category):
+    other = scene.with_objects(category=torch.tensor([int(Category.CAR), int(category)]))
+    compositor = Compositor(other)
+    assert torch.equal(
+        compositor.render(recolour(other, upper=[0.4, 0, 0], lower=[0, 0.5, 0])).image,
+        compositor.render(recolour(other, upper=[0.4, 0, 0])).image,
+    )
+
+
+def test_code_zero_of_clothes_changes_no_bit(scene):
+    compositor = Compositor(scene)
+    code = torch.zeros(2, 8, requires_grad=True)
+    assert torch.equal(
+        compositor.render(scene.with_objects(texture_code=code)).image.detach(), compositor.render(scene).image
+    )
+
+
+@pytest.mark.parametrize("start", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
+def test_the_gradient_of_clothes_is_that_of_differences_and_the_kernels(scene, start):
+    weights = torch.linspace(0, 1, scene.camera.height)[:, None]
+    chosen, slopes = [0, 1, 2, 5, 6, 7], {}
+    for backend, dtype in (("reference", torch.float64), ("warp", torch.float32)):
+        exact = convert_scene(shift(scene, 0.4), dtype)
+        compositor = Compositor(exact, RenderSettings(backend))
+
+        def total(code: torch.Tensor, compositor=compositor, exact=exact) -> torch.Tensor:
+            return (compositor.render(exact.with_objects(texture_code=code)).image * weights.to(code)).sum()
+
+        code = torch.zeros(2, 8, dtype=dtype)
+        code[1, chosen] = start
+        leaf = code.clone().requires_grad_()
+        slopes[backend] = torch.autograd.grad(total(leaf), leaf)[0][1, chosen].double()
+        if dtype == torch.float64:
+            steps = torch.eye(8, dtype=dtype)[chosen] * 1e-5
+            rows = torch.tensor([[0.0], [1.0]], dtype=dtype)
+            with torch.no_grad():
+                ends = [total(code + rows * step) - total(code - rows * step) for step in steps]
+            slopes["differences"] = torch.stack(ends) / 2e-5
+    assert bool((slopes["differences"].abs() > 0.1).all())
+    torch.testing.assert_close(slopes["reference"], slopes["differences"], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(slopes["warp"], slopes["reference"], rtol=1e-3, atol=1e-3)
+
+
 def test_the_gradient_of_a_persons_place_is_that_of_differences(scene):
     exact = convert_scene(shift(scene, 0.13), torch.float64)
     compositor = Compositor(exact, RenderSettings("reference"))
@@ -149,17 +220,25 @@ def test_the_gradient_of_a_persons_place_is_that_of_differences(scene):
 
 
 def test_the_kernels_draw_people_as_the_reference_does(scene):
-    moved = shift(scene, 0.4)
+    moved = recolour(shift(scene, 0.4), upper=[0.4, -0.3, 0.2], lower=[-0.4, 0.2, 0.5])
     images = [Compositor(scene, RenderSettings(name)).render(moved).image for name in ("warp", "reference")]
     assert float((images[0] - images[1]).abs().max()) < 1e-3
 
 
 def test_a_saved_scene_holds_its_people(scene, tmp_path):
+    scene = recolour(scene, upper=[0.25, 0.0, 0.0], lower=[0.0, 0.5, 0.0])
     save_scene(scene, tmp_path / "scene")
     loaded = load_scene(tmp_path / "scene")
     assert torch.equal(loaded.objects.category, scene.objects.category)
+    assert torch.equal(loaded.objects.texture_code, scene.objects.texture_code)
     moved = [Compositor(one).render(shift(one, 0.5)).image for one in (scene, loaded)]
     assert float((moved[0] - moved[1]).abs().max()) < 0.01
+
+
+def test_a_scene_saved_with_five_codes_keeps_them(scene, tmp_path):
+    old = scene.with_objects(texture_code=torch.tensor([[0.0] * 5, [0.25, 0.0, 0.5, 0.0, 0.0]]))
+    save_scene(old, tmp_path / "scene")
+    assert torch.equal(load_scene(tmp_path / "scene").objects.texture_code, old.objects.texture_code)
 
 
 def test_a_person_stands_behind_a_vehicle_as_if_photographed_there(scene):
@@ -279,6 +358,18 @@ def test_a_surface_is_closed_covers_its_mask_and_faces_the_camera(crossing):
     assert outline.sum() < 1.6 * mask.sum()
     depth = placement.vertices()[:, 2]
     assert 8.8 < float(depth.min()) < float(depth.max()) < 9.1
+
+
+def test_heights_of_clothes_are_those_of_the_body_without_its_soft_border(crossing):
+    body = crossing.masks[1].numpy() > 0.5
+    pose = torch.tensor(PLACE), torch.tensor(0.4), torch.tensor([0.8, 1.75, 0.6])
+    placement = upright.make_placement(grow_mask(body, 4), "Pedestrian", pose, crossing.camera, body=body)
+    rows = np.flatnonzero(body.any(1))
+    clothed = placement.mesh.faces[placement.mesh.part == Part.PAINT]
+    pixels = project(placement.vertices().float(), crossing.camera.matrix)[clothed].mean(1)[:, 1]
+    height = rows[-1] + 1 - rows[0]
+    assert float(pixels.min()) == pytest.approx(rows[-1] + 0.5 - 0.86 * height, abs=2.5)
+    assert float(pixels.max()) == pytest.approx(rows[-1] + 0.5 - 0.05 * height, abs=2.5)
 
 
 def test_an_outline_of_its_own_follows_the_mask(crossing):

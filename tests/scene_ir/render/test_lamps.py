@@ -1,16 +1,18 @@
 """Lamps of vehicles: which show, in which colour, what hides them, and their gradients to poses and weather."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from scene_ir.geometry import project
 from scene_ir.meshes.templates import KINDS, template
 from scene_ir.render import lamps, model
 from scene_ir.render.compositor import Compositor
 from scene_ir.render.prepare import RenderSettings
-from scene_ir.types import WEATHER_DIM, Crop, Objects, SceneIR, Weather
+from scene_ir.types import WEATHER_DIM, Category, Crop, Objects, SceneIR, Weather
 
 ONCOMING, AHEAD = 0, 1
 """Rows of a car that faces the camera and of one that faces away."""
@@ -66,6 +68,64 @@ def test_red_behind_and_white_in_front(compositor: Compositor) -> None:
         assert int(number.flatten()[peak]) == row + 1
     assert shares[AHEAD] < 0.2
     assert shares[ONCOMING] > 0.8
+
+
+def _riders(photographed: SceneIR, category: Category = Category.CYCLIST, **provenance: str) -> Compositor:
+    """The two cars as the surfaces of riders, or of other people."""
+    kinds = photographed.objects.category.clone()
+    kinds[[ONCOMING, AHEAD]] = int(category)
+    scene = replace(photographed.with_objects(category=kinds), provenance=provenance)
+    return Compositor(scene, RenderSettings(backend="reference"))
+
+
+def test_a_rider_has_one_lamp_at_either_end_on_the_centre_line(photographed: SceneIR) -> None:
+    compositor = _riders(photographed)
+    objects = compositor.scene.objects
+    night = _code(night=1.0)
+    everything = _light(compositor, night)
+    for row, height_m, white in ((ONCOMING, 0.9, True), (AHEAD, 0.6, False)):
+        own = everything - lamps.draw_lamps(
+            _without(compositor, row),
+            compositor.scene,
+            objects,
+            compositor.render(compositor.scene).object_id,
+            replace(compositor.scene.environment, weather=night),
+            compositor.centre,
+        )
+        red, green, _ = own.sum(dim=(1, 2)).tolist()
+        assert (green > 0.8 * red) == white
+        place = objects.translation[row] - torch.tensor([0.0, height_m, 0.0]).to(objects.translation)
+        x, y = project(place[None], compositor.scene.camera.matrix)[0].tolist()
+        peak = divmod(int(own[0].flatten().argmax()), own.shape[2])
+        assert peak == (pytest.approx(y, abs=1.0), pytest.approx(x, abs=1.0))
+    across = objects.yaw.clone()
+    for row in (ONCOMING, AHEAD):
+        x, _, z = objects.translation[row].tolist()
+        across[row] = math.atan2(x, z)
+    side = compositor.scene.with_objects(yaw=across)
+    assert float(_light(compositor, night, side).sum()) < 0.1 * float(everything.sum())
+
+
+@pytest.mark.parametrize(
+    ("category", "provenance"), [(Category.PEDESTRIAN, {}), (Category.CYCLIST, {"places": "estimated"})]
+)
+def test_people_on_foot_and_riders_of_unknown_heading_have_no_lamps(
+    photographed: SceneIR, category: Category, provenance: dict[str, str]
+) -> None:
+    compositor, night = _riders(photographed, category, **provenance), _code(night=1.0)
+    codes = torch.zeros_like(compositor.scene.objects.lamps)
+    codes[[ONCOMING, AHEAD]] = 1.0
+    dark = compositor.scene.with_objects(lamps=-torch.ones_like(codes))
+    braking = compositor.scene.with_objects(lamps=codes)
+    assert not _light(compositor, night, dark).any()
+    others = [row for row in range(len(codes)) if row not in (ONCOMING, AHEAD)]
+    number = compositor.render(braking).object_id
+    environment = replace(compositor.scene.environment, weather=night)
+    driven = compositor.lamps.driven.clone()
+    driven[others] = 0.0
+    own = replace(compositor.lamps, driven=driven)
+    lit = lamps.draw_lamps(own, compositor.scene, braking.objects, number, environment, compositor.centre)
+    assert not lit.any()
 
 
 def test_lamps_are_hidden_by_nearer_surfaces(compositor: Compositor) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.methods.base import MarginOracle
-from drivesem.attacks.space import SPECS, Parameter, ParameterSpace
+from drivesem.attacks.space import Parameter, ParameterSpace
 from scene_ir import ffd
 from scene_ir.errors import RangeError
 
@@ -101,7 +101,7 @@ def measure(
 
 
 def _of(space: ParameterSpace, parameter: Parameter, generator: torch.Generator) -> Iterator[SlopeProbe]:
-    spec, where = SPECS[parameter], space.blocks[parameter]
+    spec, where = space.specs[parameter], space.blocks[parameter]
     size, step = spec.size, getattr(space.steps, parameter.value)
     row = parameter.value
     if parameter is Parameter.MESH:

@@ -103,6 +103,19 @@ def test_paint_codes_have_their_effect() -> None:
     np.testing.assert_allclose(half, (grey + painted([0.5, 0, 0, 0, 0], grey)) / 2, atol=1e-4)
 
 
+def test_clothes_below_the_waist_have_codes_of_their_own() -> None:
+    column, height = (
+        np.full((5, 1, 3), 0.3, np.float32),
+        np.array([[0.9], [0.56], [0.53], [0.5], [0.1]], np.float32),
+    )
+    code = np.array([0, 0.5, 0, 0, 0, 0, -0.5, 0], np.float32)
+    red, _, blue = np.moveaxis(shading.apply_paint(column, code, np.ones((5, 1), np.float32), height, BASE), 2, 0)
+    redder = (red - blue)[:, 0]
+    assert redder[0] == redder[1] > 0.05
+    assert redder[3] == redder[4] < -0.05
+    assert abs(redder[2]) < 0.02
+
+
 def test_shadows_go_under_a_closed_sky() -> None:
     clear, closed = np.zeros(WEATHER_DIM, np.float32), np.eye(WEATHER_DIM, dtype=np.float32)[Weather.OVERCAST]
     assert shading.remaining_shade(clear) == 1

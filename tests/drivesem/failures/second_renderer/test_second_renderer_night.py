@@ -99,6 +99,29 @@ def test_tail_lamps_are_red_brake_lamps_brighter_and_off_is_off(codes: dict[str,
         assert (brake - on)[lamp].max() > 0.05
 
 
+def test_a_rider_has_one_lamp_white_ahead_and_red_behind() -> None:
+    environment, rides = surroundings(0.0, night=1.0), np.array([True])
+    across = float(np.arctan2(CAR.translation[0], CAR.translation[2]))
+    for yaw, height_m, white in ((CAR.yaw, 0.6, False), (CAR.yaw + np.pi, 0.9, True), (across, 0.6, None)):
+        pose = VehiclePose(CAR.translation, yaw, CAR.size_lhw, CAR.lattice)
+        off, on = (
+            apply_night(IMAGE, DEPTH_M, OWNER, environment, CAMERA, [pose], np.array([code], np.float32), rides)
+            for code in (-1.0, 0.0)
+        )
+        light = on - off
+        if white is None:
+            assert light.max() < 0.05
+            continue
+        red, green, _ = light.sum(axis=(0, 1))
+        assert (green > 0.8 * red) == white
+        row, column = np.unravel_index(light[..., 0].argmax(), light.shape[:2])
+        x, up, z = CAR.translation - np.array([0, height_m, 0])
+        assert (row, column) == (
+            pytest.approx(HORIZON + FOCAL * up / z, abs=1),
+            pytest.approx(WIDTH / 2 + FOCAL * x / z, abs=1),
+        )
+
+
 def test_a_parked_car_is_dark() -> None:
     aside = VehiclePose(CAR.translation + np.array([2.5, 0, 0], np.float32), CAR.yaw, CAR.size_lhw, CAR.lattice)
     owner = np.roll(OWNER, 75, axis=1)

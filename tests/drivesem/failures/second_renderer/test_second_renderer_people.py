@@ -40,6 +40,25 @@ def test_both_renderers_draw_a_moved_person_alike(scene, screen):
     assert float(before[person].mean()) > 2 * float(apart[person].mean())
 
 
+@pytest.mark.slow
+def test_both_renderers_recolour_clothes_below_the_waist_alike(scene, screen):
+    (row, *_) = scene.objects.upright.nonzero()[:, 0].tolist()
+    scene = scene.with_objects(category=scene.objects.category.index_fill(0, torch.tensor([row]), 2))
+    code = torch.zeros_like(scene.objects.texture_code)
+    code[row, 5:] = torch.tensor([0.5, 0.5, 0.0])
+    renderer = SecondRenderers("kitti", None).renderer_for("generated", scene)
+    changes = []
+    for render in (Compositor(scene).render, renderer.render):
+        apart = render(scene.with_objects(texture_code=code)).image - render(scene).image
+        changes.append(apart.abs().sum(dim=0))
+    assert float(changes[0].sum()) == pytest.approx(float(changes[1].sum()), rel=0.3)
+    tops = [int((change > 0.05).any(dim=1).nonzero()[0]) for change in changes]
+    assert tops[0] == pytest.approx(tops[1], abs=2)
+    other = scene.with_objects(category=scene.objects.category.index_fill(0, torch.tensor([row]), 3))
+    riders = SecondRenderers("kitti", None).renderer_for("generated", other)
+    assert torch.equal(riders.render(other.with_objects(texture_code=code)).image, riders.render(other).image)
+
+
 def test_surfaces_get_the_outlines_of_their_mattes(scene):
     trimmed = upright.trim_to_mattes(scene)
     for row, flag in enumerate(scene.objects.upright.tolist()):
