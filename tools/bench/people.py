@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from detectors.boxes import iou_matrix
 from detectors.registry import load_predictor
 from detectors.types import CLASSES
 from drivesem.attacks.budgets import PRESETS, STREET
@@ -37,7 +38,7 @@ from scene_ir.io import to_uint8
 from scene_ir.removal import remove_objects
 from scene_ir.render.compositor import Compositor, render
 from scene_ir.types import UPRIGHT, SceneIR
-from tools.bench.found import failure_sheet
+from tools.bench.found import LOOSE_IOU, failure_sheet
 from tools.bench.settings import BenchTool
 from tools.bench.sights import CarView, DetectorSight, DetectorView, Picture, assign
 
@@ -57,7 +58,8 @@ METHOD = (
     "object only. Exact: frames whose render without a change, as an 8-bit picture, is the photograph. Moved: each one "
     "alone, by 0.5, 1 and 2 m along the heading or across, the first of the four ways, in random order, that the "
     "projection of the budget street leaves as it is and that hides and cuts the person no more; of those found in "
-    "the photograph, the ones found at their moved boxes. Removed: of the same, places where a person is still found "
+    "the photograph, the ones found at their moved boxes; moved away: moves to a box with an IoU below 0.3 with the "
+    "old one, after which a person is still found there. Removed: of the same, places where a person is still found "
     "after all of them were taken out. Generated streets: mean absolute difference, in levels of 255, from the "
     "generator's picture of the moved person in that person's true new box; pasted: the old box of the photograph "
     "copied there, foot to foot; medians. Intervals: Wilson, 95 %."
@@ -79,6 +81,8 @@ class PersonMove:
     """(along the heading, across)."""
     sight: DetectorSight
     """At the moved box."""
+    left: DetectorSight | None
+    """At the old box, given to no other; None where the moved box overlaps it."""
     ours: float | None = None
     """Levels between our picture and the generator's, in the true new box; None for photographs."""
     pasted: float | None = None
@@ -172,8 +176,11 @@ class PeopleJudge:
                 after = self._view.view_cars(step.image, step.boxes_xyxy[people])
                 if before.assigned[place].found and not after.assigned[place].found:
                     self._write(name, place, f"moved-{metres:g}", before, after)
+                left = self._left_behind(after, before.boxes_xyxy[place : place + 1], place)
+                if before.assigned[place].found and left is not None and left.found:
+                    self._write(name, place, f"left-{metres:g}", before, after)
                 errors = self._compare(name, scene, step.scene, row, after.picture)
-                moved.append(PersonMove(metres, step.shift_m, after.assigned[place], *errors))
+                moved.append(PersonMove(metres, step.shift_m, after.assigned[place], left, *errors))
             found.append(
                 PersonRow(
                     frame=name,
@@ -188,6 +195,13 @@ class PeopleJudge:
                 )
             )
         return found
+
+    def _left_behind(self, after: CarView, old_xyxy: Tensor, place: int) -> DetectorSight | None:
+        """What is found in the old box (1, 4) of a person who moved; None where the moved box overlaps it."""
+        if float(iou_matrix(after.boxes_xyxy[place : place + 1], old_xyxy)) >= LOOSE_IOU:
+            return None
+        found = after.named(PEOPLE, self._t_star)
+        return assign(torch.cat([after.boxes_xyxy, old_xyxy]), found)[-1]
 
     def _write(self, name: str, place: int, what: str, before: CarView, after: CarView) -> None:
         if self._sheets is not None:
@@ -277,6 +291,8 @@ def summary(rows: Sequence[PersonRow]) -> list[dict[str, Any]]:
     for metres in MOVES_M:
         moved = [move.sight.found for row in known for move in row.moves if move.metres == metres]
         lines.append(_line(f"moved {metres:g} m", moved, "at least 0.9"))
+    left = [move.left.found for row in known for move in row.moves if move.left is not None]
+    lines.append(_line("moved away, found where they were", left, "none"))
     return [*lines, _line("removed", [row.removed.found for row in known], "none")]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from detectors.boxes import iou_matrix
 from drivesem.attacks.budgets import PRESETS
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.space import ParameterSpace
@@ -18,6 +19,7 @@ from scene_ir.types import Frame, SceneIR
 from tests.tools.bench.test_bench_found import Told
 from tools.bench import people
 from tools.bench.__main__ import main
+from tools.bench.found import LOOSE_IOU
 from tools.bench.settings import BenchTool
 
 CLASSES = ("Car", "Pedestrian")
@@ -42,14 +44,18 @@ def test_what_is_counted(scene, monkeypatch, tmp_path):
     boxes = scene.objects.box2d[rows]
     moves, rng, answers = people.PeopleMoves(scene), np.random.default_rng(7), [answers_of(boxes)]
     answers.append(answers_of(boxes[:1]))  # the first one leaves a person behind
-    steps = {}
+    steps, away = {}, 0
     for row in rows:
         for metres in people.MOVES_M:
             step = moves.first_feasible(row, metres, rng)
             if step is not None:
                 steps[row, metres] = step
                 missed = (row, metres) == (rows[0], 0.5)
-                answers.append([] if missed else answers_of(step.boxes_xyxy[rows]))
+                place = rows.index(row)
+                apart = float(iou_matrix(step.boxes_xyxy[row][None], boxes[place][None])) < LOOSE_IOU
+                away += apart
+                leaves = boxes[place : place + 1] if apart and place == 0 else boxes[:0]
+                answers.append([] if missed else answers_of(torch.cat([step.boxes_xyxy[rows], leaves])))
     detector = Told(answers)
     detector.classes = CLASSES  # type: ignore[assignment]
     monkeypatch.setattr(people, "load_predictor", lambda *_: detector)
@@ -62,11 +68,16 @@ def test_what_is_counted(scene, monkeypatch, tmp_path):
     lines = {line["measure"]: (line["found"], line["people"]) for line in people.summary(found)}
     assert lines["frames, exact without a change"] == (1, 1)
     assert lines["in the photograph"] == (len(rows), len(rows))
+    left = sum(move.left is not None for move in found[0].moves)
+    assert left > 0
+    assert lines["moved away, found where they were"] == (left, away)
     assert lines["removed"] == (1, len(rows))
     for metres in people.MOVES_M:
         moved = sum(key[1] == metres for key in steps)
         assert lines[f"moved {metres:g} m"] == (moved - (metres == 0.5), moved)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["moved-0.5-a-0.png", "removed-a-0.png"]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names[left:] == ["moved-0.5-a-0.png", "removed-a-0.png"]
+    assert all(name.startswith("left-") for name in names[:left])
 
 
 def test_moves_are_feasible_and_as_far_as_they_say(scene):
