@@ -298,8 +298,9 @@ class Objective:
 
     def cell_visits(self, counterexample: RenderEvaluation) -> tuple[CellVisit, ...]:
         """Visits of the benign picture and of the search, which ended at a counterexample."""
-        patches = ObjectPatches.from_image(counterexample.render.image, counterexample.moved.boxes_xyxy)
-        return self.search_log.visits(patches.cells())
+        start = ObjectPatches.from_image(self.benign.render.image, self.benign.paper.boxes_xyxy)
+        end = ObjectPatches.from_image(counterexample.render.image, counterexample.moved.boxes_xyxy)
+        return self.search_log.visits(start.cells(), end.cells())
 
     def feasible_set(self, limits: FeasibilityLimits | None = None, only_bounds: bool = False) -> FeasibleSet:
         """The feasible set of the scene. Weather keeps objects visible as far as `difficulty` requires, and vehicles

@@ -326,27 +326,40 @@ class ClusteredShare:
 
     @classmethod
     def from_frames(cls, counts: Sequence[tuple[int, int]]) -> ClusteredShare | None:
-        """Estimate the share from failing draws and draws of each frame. None for fewer than two frames with draws.
-
-        The interval is that of Clopper and Pearson for the effective number of draws: as many independent ones as
-        would vary like the ratio between frames, less for few frames (Korn and Graubard 1998). Where no draw or each
-        one fails, frames are the draws.
+        """Estimate the share from failing draws and draws of each frame; see `clustered_interval`. None for fewer than
+        two frames with draws.
         """
-        from scipy.special import betaincinv, stdtrit  # imported on use: it takes a tenth of a second
-
         failing, draws = np.array([pair for pair in counts if pair[1]], np.float64).reshape(-1, 2).T
         frames, total = len(draws), float(draws.sum())
         if frames < 2:
             return None
-        value, effective = float(failing.sum()) / total, float(frames)
-        if 0 < value < 1:
-            variance = frames / (frames - 1) * float(((failing - value * draws) ** 2).sum()) / total**2
-            student = float(stdtrit(frames - 1, 0.5 + LEVEL / 2))
-            effective = min(value * (1 - value) / max(variance, 1e-12), total) * (_Z_95 / student) ** 2
-        hits, tail = value * effective, (1 - LEVEL) / 2
-        low = float(betaincinv(hits, effective - hits + 1, tail)) if hits > 0 else 0.0
-        high = float(betaincinv(hits + 1, effective - hits, 1 - tail)) if value < 1 else 1.0
+        value = float(failing.sum()) / total
+        low, high = clustered_interval(value, (failing - value * draws) / total, total)
         return cls(int(failing.sum()), int(total), frames, value, low, high)
+
+
+def clustered_interval(value: float, influences: np.ndarray, draws: float) -> tuple[float, float]:
+    """95 % interval of a share: that of Clopper and Pearson for the effective number of draws, as many independent ones
+    as would vary like the share between frames, less for few frames (Korn and Graubard 1998). Where no draw or each one
+    fails, frames are the draws.
+
+    Args:
+        value: The share, in [0, 1].
+        influences: (F,), of each frame on the share; their sum is 0.
+        draws: Number of draws.
+    """
+    from scipy.special import betaincinv, stdtrit  # imported on use: it takes a tenth of a second
+
+    frames = len(influences)
+    effective = float(frames)
+    if 0 < value < 1:
+        variance = frames / (frames - 1) * float((influences**2).sum())
+        student = float(stdtrit(frames - 1, 0.5 + LEVEL / 2))
+        effective = min(value * (1 - value) / max(variance, 1e-12), draws) * (_Z_95 / student) ** 2
+    hits, tail = value * effective, (1 - LEVEL) / 2
+    low = float(betaincinv(hits, effective - hits + 1, tail)) if hits > 0 else 0.0
+    high = float(betaincinv(hits + 1, effective - hits, 1 - tail)) if value < 1 else 1.0
+    return low, high
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> tuple[float, float]:

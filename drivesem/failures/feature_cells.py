@@ -45,3 +45,5 @@ class CellVisit:
     """Evaluated states that no score influenced."""
     random_misses: int = 0
     """Of these, states in which it is missed."""
+    photographed: bool = False
+    """Whether it lies there in the photograph."""

@@ -129,11 +129,12 @@ class SearchLog:
         features = _join([state.patches for state in states]).features()
         return torch.cat([features, margins[:, None]], 1).float().numpy()
 
-    def visits(self, counterexample: Sequence[Cell]) -> tuple[CellVisit, ...]:
+    def visits(self, photograph: Sequence[Cell], counterexample: Sequence[Cell]) -> tuple[CellVisit, ...]:
         """All visits, by object and cell.
 
         Args:
-            counterexample: Cell of each object in the counterexample, which the search has evaluated.
+            photograph: Cell of each object in the photograph.
+            counterexample: The same in the counterexample. The search has evaluated both.
         """
         if not self._states:
             return ()
@@ -146,9 +147,9 @@ class SearchLog:
         for index, cell, state, miss in zip(objects.tolist(), cells, states, missed.tolist(), strict=True):
             row = np.array([state.passes, miss, state.random, state.random and miss])
             counts[index, cell] = counts.get((index, cell), 0) + row
-        ends = set(enumerate(counterexample))
+        start, end = set(enumerate(photograph)), set(enumerate(counterexample))
         visits: list[CellVisit] = []
         for pair, row in sorted(counts.items()):
             passes, misses, random, random_misses = row.tolist()
-            visits.append(CellVisit(*pair, passes, misses, pair in ends, random, random_misses))
+            visits.append(CellVisit(*pair, passes, misses, pair in end, random, random_misses, pair in start))
         return tuple(visits)

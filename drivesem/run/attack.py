@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import time
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -51,12 +52,12 @@ from drivesem.run.allocation import release_freed_memory
 from drivesem.run.driver import JobResults, ProgressSettings, run_frame_jobs
 from drivesem.run.finished import MANIFEST, METRICS, AttackRun, build_manifest, hash_json, load_runs
 from drivesem.run.folder import FRAMES, PLAN, claim_folder, load_run_detector, load_trusted_config, result_settings
-from drivesem.run.frame import AttackedScene, estimate_rate, grade_failures, summarise_frames, write_frame
+from drivesem.run.frame import AttackedScene, estimate_rates, grade_failures, summarise_frames, write_frame
 from drivesem.run.labels import RESULT
 from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.run_report import write_run_report
-from drivesem.run.search_memory import SearchMemory
+from drivesem.run.search_memory import SearchedFrame, SearchMemory
 from drivesem.scenes.sources import NoVehicleError, SceneSource, compile_source_kernels, open_source
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
@@ -339,6 +340,12 @@ class AttackWorker:
         config = _resolve_budget(config)
         return replace(self, config=config, params=resolve_parameters(config), method=build_attack(config))
 
+    def with_memory(self, memory: SearchMemory) -> AttackWorker:
+        """The same with what `learn` knows of finished frames, for the next one."""
+        assert isinstance(self.method, Learn)
+        passes = memory.allowance(self.method.passes)
+        return replace(self, method=Learn(passes, model=memory.model()))
+
     def attack_frame(self, identifier: str, out: Path) -> bool:
         """Attack a frame of the source and write its folder; False where it has no vehicle to attack. The result
         stays on disk: a run has thousands of a quarter megabyte each.
@@ -346,7 +353,7 @@ class AttackWorker:
         worker = self
         if isinstance(self.method, Learn):
             self.memory.read(out / FRAMES)
-            worker = replace(self, method=replace(self.method, model=self.memory.model()))
+            worker = self.with_memory(self.memory)
         try:
             attacked = worker.attack_scene(identifier, self.source.scene(identifier))
         except NoVehicleError:
@@ -363,16 +370,16 @@ class AttackWorker:
         """
         start = time.perf_counter()
         self._check_vehicles(identifier, scene)
-        config = self.config
+        config, seed = self.config, self._frame_seed(identifier)
         scene = convert_scene(scene, None, detector_device(self.detector))
         method = self.method if config.like is None else _load_placebo(Path(config.like), identifier)
         try:
             instance, other_passes = self._pose(identifier, scene), 0
             theta0 = instance.objective.space.theta0
             if not instance.objective.found_before and config.objective != "phantom":
-                result = FixedTheta(theta0)(instance.problem, theta0, config.seed)  # nothing can be lost
+                result = FixedTheta(theta0)(instance.problem, theta0, seed)  # nothing can be lost
             elif self.changes is None:
-                result = method(instance.problem, theta0, config.seed)
+                result = method(instance.problem, theta0, seed)
             else:
                 instance, result, other_passes = self._search_with_changes(
                     identifier, scene, instance, self.changes
@@ -390,7 +397,7 @@ class AttackWorker:
                 instance.feasible,
                 result,
                 self.grader if config.grade else None,
-                config.seed,
+                seed,
             )
         except (RangeError, ShapeError) as error:
             # The error of a loss or gradient that is not finite names the coordinate, but not the frame.
@@ -408,10 +415,16 @@ class AttackWorker:
             grade_notes=notes,
             passes=passes,
             visits=objective.cell_visits(evaluation),
-            margin_rows=objective.search_log.margin_rows() if isinstance(method, Learn) else None,
+            searched=(
+                SearchedFrame(objective.search_log.margin_rows(), passes) if isinstance(method, Learn) else None
+            ),
             seconds=end - start,
             grading_seconds=end - search_end,
         )
+
+    def _frame_seed(self, identifier: str) -> int:
+        """The seed of a frame's randomness: with one for all, frames of equally many objects would share states."""
+        return zlib.crc32(f"{self.config.seed}:{identifier}".encode())
 
     def _check_vehicles(self, identifier: str, scene: SceneIR) -> None:
         count, rows = len(scene.objects), TargetSelection.from_options(self.config.target_objects, None).objects
@@ -441,10 +454,11 @@ class AttackWorker:
         assert isinstance(attack, MarginSearch)
         count = count_affordable_proposals(attack.passes)
         attack = replace(attack, passes=attack.passes - proposal_passes(count))
-        result = attack(unchanged.problem, unchanged.objective.space.theta0, config.seed)
-        scenes = propose_scenes(scene, changes, count, config.seed, RenderSettings(backend=config.backend))
+        seed = self._frame_seed(identifier)
+        result = attack(unchanged.problem, unchanged.objective.space.theta0, seed)
+        scenes = propose_scenes(scene, changes, count, seed, RenderSettings(backend=config.backend))
         proposals = (self._pose(identifier, changed) for changed in scenes)
-        return _choose_change(unchanged, result, proposals, config.seed)
+        return _choose_change(unchanged, result, proposals, seed)
 
 
 def _choose_change(
@@ -688,7 +702,7 @@ def summarise_run(
         frames_without_vehicles=0,
         frames_failed={},
         seconds=0.0,
-        rate=None if config.changes else estimate_rate(results),
+        **({} if config.changes else estimate_rates(results)),
         **summarise_frames(results, classes, t_star, headline),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections import Counter
@@ -26,7 +27,7 @@ from drivesem.attacks.targets import EvaluatedClasses
 from drivesem.data import kitti
 from drivesem.evaluation import coco
 from drivesem.evaluation.failures import FrameFailures
-from drivesem.evaluation.resampling import ClusteredShare, Proportion
+from drivesem.evaluation.resampling import ClusteredShare, Proportion, clustered_interval
 from drivesem.failures.certificate import CompositorRenderer, pad_visible_boxes
 from drivesem.failures.feature_cells import CellVisit
 from drivesem.failures.grades import Grade, Kind
@@ -41,10 +42,11 @@ from drivesem.run.results import (
     Coordinate,
     Failure,
     FrameResult,
+    PhotographedRate,
     VehicleCounts,
     dump_frame,
 )
-from drivesem.run.search_memory import MARGINS
+from drivesem.run.search_memory import MARGINS, SearchedFrame, write_searched_frame
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene, to_uint8
@@ -75,8 +77,8 @@ class AttackedScene:
     """Detector passes, a gradient counted as 3."""
     visits: tuple[CellVisit, ...]
     """Where in feature space the objects were evaluated."""
-    margin_rows: np.ndarray | None
-    """(R, F + 1), features and margins for the searches of other frames; None where none reads them."""
+    searched: SearchedFrame | None
+    """What the searches of other frames learn from; None where none does."""
     seconds: float
     """Total time."""
     grading_seconds: float
@@ -170,8 +172,8 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
             for c in result.theta
         },
     )
-    if attacked.margin_rows is not None:
-        files.write_npz(part / MARGINS, {"rows": attacked.margin_rows})
+    if attacked.searched is not None:
+        write_searched_frame(part / MARGINS, attacked.searched)
     files.write_text(part / RESULT, dump_frame(result))
 
 
@@ -491,6 +493,11 @@ def build_map(results: Sequence[FrameResult]) -> FailureMap:
     )
 
 
+def estimate_rates(results: Sequence[FrameResult]) -> dict[str, Any]:
+    """Compute the rates of `RunSummary`."""
+    return {"rate": estimate_rate(results), "rate_as_photographed": estimate_photographed_rate(results)}
+
+
 def estimate_rate(results: Sequence[FrameResult]) -> ClusteredShare | None:
     """Estimate how often a random state loses a vehicle that is found before, from the states that no score of the
     search influenced; for runs without changes of vehicles, which are chosen by scores. None for fewer than two frames
@@ -501,6 +508,32 @@ def estimate_rate(results: Sequence[FrameResult]) -> ClusteredShare | None:
         visits = [visit for visit in result.visits if visit.index in result.found_before]
         counts.append((sum(v.random_misses for v in visits), sum(v.random for v in visits)))
     return ClusteredShare.from_frames(counts)
+
+
+def estimate_photographed_rate(results: Sequence[FrameResult]) -> PhotographedRate | None:
+    """Weight the states of `estimate_rate` so that objects are distributed over cells as in the photographs. None
+    where fewer than two frames have such states, or no photographed object is in a cell with any, which holds for
+    frames of earlier versions.
+    """
+    frames = [[visit for visit in r.visits if visit.index in r.found_before] for r in results]
+    visits = list(itertools.chain.from_iterable(frames))
+    cells = {cell: place for place, cell in enumerate(sorted({v.cell for v in visits if v.random}))}
+    counts = np.zeros((len(frames), 3, len(cells)))  # photographed, random states, misses in these
+    for row, visited in zip(counts, frames, strict=True):
+        for visit in visited:
+            if visit.cell in cells:
+                row[:, cells[visit.cell]] += visit.photographed, visit.random, visit.random_misses
+    photographed, draws, misses = counts.sum(0)
+    if not photographed.sum() or np.count_nonzero(counts[:, 1].sum(1)) < 2:
+        return None
+    weights, rates = photographed / photographed.sum(), misses / draws
+    value = float(weights @ rates)
+    # A frame influences the rate of each cell, and how many photographed objects the cell has.
+    by_rate = (counts[:, 2] - rates * counts[:, 1]) @ (weights / draws)
+    by_weight = counts[:, 0] @ (rates - value) / photographed.sum()
+    low, high = clustered_interval(value, by_rate + by_weight, float(draws.sum()))
+    covered = photographed.sum() / sum(visit.photographed for visit in visits)
+    return PhotographedRate(value, low, high, float(covered))
 
 
 def count_objects(results: Sequence[FrameResult]) -> dict[str, Any]:

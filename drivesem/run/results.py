@@ -220,6 +220,20 @@ class ClassSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class PhotographedRate:
+    """A rate over random states, weighted to the distribution of objects over cells in a run's photographs."""
+
+    value: float
+    """The rate, in [0, 1]."""
+    low: float
+    """Lower end of the 95 % interval."""
+    high: float
+    """Upper end."""
+    covered: float
+    """Share of the photographed objects in cells with random states, in [0, 1]; the rate is that of these."""
+
+
+@dataclass(frozen=True, slots=True)
 class RunSummary:
     """Summary of a run."""
 
@@ -292,6 +306,9 @@ class RunSummary:
     rate: ClusteredShare | None = None
     """How often a random state loses an object that is found before; None where the method does not sample states."""
 
+    rate_as_photographed: PhotographedRate | None = None
+    """The same for objects of the size, contrast, place and light that they have in the photographs."""
+
     @property
     def noun(self) -> str:
         """What the objects are called: vehicles, unless people are among them."""
@@ -317,11 +334,16 @@ class RunSummary:
         """The rate in one line, "" without one."""
         if self.rate is None:
             return ""
-        share, low, high = (
-            f"{round(100 * end, 6):.3g}" for end in (self.rate.value, self.rate.low, self.rate.high)
+        rate, weighted = self.rate, self.rate_as_photographed
+        draws = f"{rate.draws:,} {self.noun}s in random states of {rate.frames} frames"
+        line = f"rate: {rate.failing:,} of {draws} missed ({_format_share(rate)})"
+        if weighted is None:
+            return line
+        covered = f"{100 * weighted.covered:.0f} % of the {self.noun}s"
+        return (
+            f"{line}; {_format_share(weighted)} with size, contrast, place and light distributed as photographed "
+            f"({covered} are in cells that such states met)"
         )
-        draws = f"{self.rate.draws:,} {self.noun}s in random states of {self.rate.frames} frames"
-        return f"rate: {self.rate.failing:,} of {draws} missed ({share} % [{low}, {high}])"
 
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object with totals, followed by counts by class."""
@@ -338,6 +360,9 @@ class RunSummary:
             "by_class": {name: dataclasses.asdict(one) for name, one in self.by_class.items()},
             "map": self.map.to_json(),
             "rate": None if self.rate is None else dataclasses.asdict(self.rate),
+            "rate_as_photographed": (
+                None if self.rate_as_photographed is None else dataclasses.asdict(self.rate_as_photographed)
+            ),
             "lost_by_grade": {grade: dataclasses.asdict(share) for grade, share in self.lost_by_grade.items()},
             "benign": self.benign.to_json(),
             "rerendered": self.rerendered.to_json(),
@@ -364,3 +389,9 @@ def load_frame(path: Path) -> FrameResult:
             expected = f"one of {len(result.targets_moved)} targets"
             raise FormatError(f"{path}: failures[{i}].index", expected, failure.index)
     return result
+
+
+def _format_share(share: ClusteredShare | PhotographedRate) -> str:
+    """Such as 12.5 % [8.31, 17.9]; without exponents."""
+    value, low, high = (f"{round(100 * end, 6):.3g}" for end in (share.value, share.low, share.high))
+    return f"{value} % [{low}, {high}]"

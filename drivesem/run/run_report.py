@@ -26,7 +26,7 @@ from drivesem.failures.grades import Grade
 from drivesem.reporting.tables import format_count
 from drivesem.run.finished import METRICS, load_runs
 from drivesem.run.folder import CONFIG, load_attack_config
-from drivesem.run.frame import build_map, estimate_rate, summarise_frames, targets_and_detections
+from drivesem.run.frame import build_map, estimate_rates, summarise_frames, targets_and_detections
 from drivesem.run.records import from_json
 from drivesem.run.report.html import render_report
 from drivesem.run.report.page import (
@@ -221,8 +221,8 @@ def load_reported_runs(folders: Sequence[str]) -> tuple[list[ReportedRun], int]:
     for run in loaded:
         results = [frame.result for frame in run.frames if frame.result.identifier in shared]
         config = load_attack_config(run.folder, "RUN")
-        rate = None if config.changes else estimate_rate(results)
-        summary = replace(_load_summary(run.folder / METRICS), map=build_map(results), rate=rate)
+        rates = {} if config.changes else estimate_rates(results)
+        summary = replace(_load_summary(run.folder / METRICS), map=build_map(results), **rates)
         if len(shared) < len(every):
             summary = _recompute_summary(summary, results)
         reported.append(_make_reported_run(run.name, run.folder, config, summary, results))

@@ -10,6 +10,7 @@ from drivesem.failures.search_log import OBJECT_FEATURES, ObjectPatches, SearchL
 
 BOXES = torch.tensor([[10.0, 20, 90, 50], [300, 30, 400, 130]])
 SMALL_LEFT, LARGE_RIGHT = (0, 1, 0, 1), (2, 1, 2, 1)
+DARK = (0, 1, 0, 0)
 
 
 def picture(light: float = 0.5) -> torch.Tensor:
@@ -48,19 +49,19 @@ def test_visits_count_passes_and_misses_by_object_and_cell() -> None:
     log.record(picture(0.1), both[:1], BOXES[:1], torch.tensor([True]), passes=1)
     log.record(picture(), both[:0], BOXES[:0], torch.zeros(0, dtype=torch.bool), passes=1)
     found = [
-        (visit.index, visit.cell, visit.passes, visit.misses, visit.final)
-        for visit in log.visits([SMALL_LEFT, SMALL_LEFT])
+        (visit.index, visit.cell, visit.passes, visit.misses, visit.photographed, visit.final)
+        for visit in log.visits([DARK, SMALL_LEFT], [SMALL_LEFT, SMALL_LEFT])
     ]
-    dark = (0, 1, 0, 0)
-    assert found == [(0, dark, 1, 1, False), (0, SMALL_LEFT, 1, 0, True), (4, LARGE_RIGHT, 4, 2, False)]
-    assert SearchLog().visits([]) == ()
+    dark, left, right = (0, DARK, 1, 1), (0, SMALL_LEFT, 1, 0), (4, LARGE_RIGHT, 4, 2)
+    assert found == [(*dark, True, False), (*left, False, True), (*right, False, False)]
+    assert SearchLog().visits([], []) == ()
 
 
 def test_visits_count_random_states_apart() -> None:
     log = SearchLog()
     for misses, random in ((True, False), (True, True), (False, True)):
         log.record(picture(), torch.tensor([0]), BOXES[:1], torch.tensor([misses]), passes=1, random=random)
-    (visit,) = log.visits([])
+    (visit,) = log.visits([], [])
     assert (visit.passes, visit.misses, visit.random, visit.random_misses) == (3, 2, 2, 1)
 
 

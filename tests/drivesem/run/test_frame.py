@@ -19,12 +19,11 @@ from drivesem.config.commands import AttackConfig
 from drivesem.evaluation.resampling import ClusteredShare
 from drivesem.failures.feature_cells import CellVisit
 from drivesem.run.attack import AttackWorker
-from drivesem.run.frame import estimate_rate, write_frame
-from drivesem.run.results import RunSummary
-from drivesem.run.search_memory import MARGINS, read_margin_rows
+from drivesem.run.frame import estimate_photographed_rate, estimate_rate, write_frame
+from drivesem.run.results import PhotographedRate, RunSummary
+from drivesem.run.search_memory import MARGINS, SearchedFrame, read_searched_frame, write_searched_frame
 from drivesem.scenes.sources import NoVehicleError
 from drivesem.synth.demo import demo_scene
-from scene_ir import files
 
 
 @pytest.mark.parametrize("options", [{"method": "learn", "passes": 40}, {"method": "random", "queries": 4}])
@@ -54,17 +53,21 @@ def test_layers_are_released_after_a_frame(
     learns = options["method"] == "learn"
     assert (tmp_path / "demo-000" / MARGINS).is_file() is learns
     if learns:
-        assert len(read_margin_rows(tmp_path / "demo-000" / MARGINS)) > 20
+        searched = read_searched_frame(tmp_path / "demo-000" / MARGINS)
+        assert len(searched.rows) > 20
+        assert searched.passes == attacked.passes
 
 
 def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     models: list[MarginModel | None] = []
+    passes: list[int] = []
 
     def stop(worker: AttackWorker, identifier: str, scene: object) -> None:
         assert isinstance(worker.method, Learn)
         models.append(worker.method.model)
+        passes.append(worker.method.passes)
         raise NoVehicleError("frame", "a vehicle", "none")
 
     monkeypatch.setattr(AttackWorker, "attack_scene", stop)
@@ -75,10 +78,10 @@ def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
         assert not worker.attack_frame("demo-000", tmp_path)
         folder = tmp_path / "frames" / f"{number:03}"
         folder.mkdir(parents=True)
-        files.write_npz(
-            folder / MARGINS, {"rows": np.random.default_rng(number).random((60, 7)).astype(np.float32)}
-        )
+        rows = np.random.default_rng(number).random((60, 7)).astype(np.float32)
+        write_searched_frame(folder / MARGINS, SearchedFrame(rows, 80))
     assert [model is None for model in models] == [True, True, True, True, False]
+    assert passes == [90, 100, 110, 120, 130]
 
 
 def sampled(found: tuple[int, ...], *visits: tuple[int, int, int]) -> Any:
@@ -99,9 +102,57 @@ def test_a_rate_leaves_out_searched_states_and_objects_missed_before() -> None:
 
 
 def test_a_rate_is_printed_without_exponents() -> None:
-    summary: Any = SimpleNamespace(rate=ClusteredShare(10, 31, 2, 10 / 31, 2.4e-59, 1.0), noun="object")
+    share, weighted = ClusteredShare(10, 31, 2, 10 / 31, 2.4e-59, 1.0), PhotographedRate(0.125, 0.1, 0.2, 0.96)
+    summary: Any = SimpleNamespace(rate=share, rate_as_photographed=None, noun="object")
     text = RunSummary.describe_rate(summary)
     assert text == "rate: 10 of 31 objects in random states of 2 frames missed (32.3 % [0, 100])"
+    summary.rate_as_photographed = weighted
+    assert RunSummary.describe_rate(summary) == (
+        f"{text}; 12.5 % [10, 20] with size, contrast, place and light distributed as photographed "
+        "(96 % of the objects are in cells that such states met)"
+    )
+
+
+def cells_of(*visits: tuple[int, int, int, bool], found: bool = True) -> Any:
+    """A frame with one object, and its visits: height level, random states, misses in them, photographed there."""
+    counts = [
+        CellVisit(0, (level, 0, 0, 0), n + 5, m + 4, random=n, random_misses=m, photographed=there)
+        for level, n, m, there in visits
+    ]
+    return SimpleNamespace(found_before=(0,) if found else (), visits=tuple(counts))
+
+
+def test_a_rate_weighted_to_the_photographs_counts_cells_as_they_occur_there() -> None:
+    frames = [
+        cells_of((0, 12, 6, False), (1, 4, 0, True)),
+        cells_of((0, 12, 6, True), (1, 4, 2, False)),
+        cells_of((1, 8, 2, True)),
+        cells_of((0, 16, 16, True), found=False),
+        cells_of((2, 0, 0, True)),
+    ]
+    rate = estimate_photographed_rate(frames)
+    assert rate is not None
+    # A third of the covered objects are small as photographed, of which half is missed; 4 of 16 of the others are.
+    assert rate.value == pytest.approx(0.5 / 3 + 0.25 * 2 / 3)
+    assert rate.covered == 0.75
+    assert rate.low < rate.value < rate.high
+    assert estimate_photographed_rate([cells_of((0, 12, 6, False))] * 3) is None
+
+
+def test_the_interval_of_a_weighted_rate_holds_it_in_as_many_runs_as_it_should() -> None:
+    rng, held, truth = np.random.default_rng(0), 0, 0.2 * 0.3 + 0.8 * 0.1
+    for _ in range(200):
+        frames: list[Any] = []
+        for _ in range(60):
+            draws = rng.multinomial(32, [0.7, 0.3])  # random states are mostly in the cell that is rare on roads
+            chances = rng.beta([1.2, 0.4], [2.8, 3.6])  # 0.3 and 0.1 in the mean
+            misses, small = rng.binomial(draws, chances), rng.random() < 0.2
+            rows = zip((0, 1), draws.tolist(), misses.tolist(), (small, not small), strict=True)
+            frames.append(cells_of(*rows))
+        rate = estimate_photographed_rate(frames)
+        assert rate is not None
+        held += rate.low <= truth <= rate.high
+    assert 0.91 <= held / 200 <= 0.99
 
 
 @pytest.mark.parametrize(
