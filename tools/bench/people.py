@@ -55,8 +55,8 @@ GENERATOR_COLUMNS: Columns = {
 METHOD = (
     "People and cyclists that became objects, frames in order until --frames have some. Found: a detection of class "
     "Pedestrian or Cyclist with a score above t* and an IoU of at least 0.5 with the box, each detection for one "
-    "object only. Exact: frames whose render without a change, as an 8-bit picture, is the photograph. Moved: each one "
-    "alone, by 0.5, 1 and 2 m along the heading or across, the first of the four ways, in random order, that the "
+    "object only. Exact: frames in which the render without a change, as an 8-bit picture, is the photograph. Moved: "
+    "each one alone, by 0.5, 1 and 2 m along the heading or across, the first of the four ways, in random order, that the "
     "projection of the budget street leaves as it is and that hides and cuts the person no more; of those found in "
     "the photograph, the ones found at their moved boxes; moved away: moves to a box with an IoU below 0.3 with the "
     "old one, after which a person is still found there. Removed: of the same, places where a person is still found "

@@ -16,7 +16,7 @@ from drivesem.cli import main as drivesem
 from drivesem.synth.frames import plan_frame, render_frame
 from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.types import Frame, SceneIR
-from tests.tools.bench.test_bench_found import Told
+from tests.tools.bench.test_bench_found import Rows, Told
 from tools.bench import people
 from tools.bench.__main__ import main
 from tools.bench.found import LOOSE_IOU
@@ -35,16 +35,18 @@ def scene() -> SceneIR:
     return derender(found, DerenderSettings(fit=False, people=True))
 
 
-def answers_of(boxes: torch.Tensor) -> list[tuple[list[float], int, float]]:
+def answers_of(boxes: torch.Tensor) -> Rows:
     return [(box, 1, 0.9) for box in boxes.tolist()]
 
 
-def test_what_is_counted(scene, monkeypatch, tmp_path):
+def test_what_is_counted(scene: SceneIR, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rows = scene.objects.upright.nonzero()[:, 0].tolist()
     boxes = scene.objects.box2d[rows]
-    moves, rng, answers = people.PeopleMoves(scene), np.random.default_rng(7), [answers_of(boxes)]
+    moves, rng = people.PeopleMoves(scene), np.random.default_rng(7)
+    answers: list[Rows] = [answers_of(boxes)]
     answers.append(answers_of(boxes[:1]))  # the first one leaves a person behind
-    steps, away = {}, 0
+    steps: dict[tuple[int, float], people.PeopleMove] = {}
+    away = 0
     for row in rows:
         for metres in people.MOVES_M:
             step = moves.first_feasible(row, metres, rng)
@@ -80,25 +82,25 @@ def test_what_is_counted(scene, monkeypatch, tmp_path):
     assert all(name.startswith("left-") for name in names[:left])
 
 
-def test_moves_are_feasible_and_as_far_as_they_say(scene):
+def test_moves_are_feasible_and_of_their_length(scene: SceneIR) -> None:
     moves, space = people.PeopleMoves(scene), ParameterSpace(scene, ("translate",), PRESETS["street"])
-    row = scene.objects.upright.nonzero()[0, 0].item()
-    ways = set()
+    row = int(scene.objects.upright.nonzero()[0, 0])
+    directions: set[tuple[float, float]] = set()
     for seed in range(6):
         step = moves.first_feasible(row, 0.5, np.random.default_rng(seed))
         assert step is not None
-        ways.add(step.shift_m)
+        directions.add(step.shift_m)
         apart = (step.scene.objects.translation - scene.objects.translation).norm(dim=1)
         assert apart[row].item() == pytest.approx(0.5, abs=1e-4)
         assert float(apart.sum()) == pytest.approx(0.5, abs=1e-4)
         theta = space.theta0.clone()
         theta[2 * row : 2 * row + 2] = torch.tensor(step.shift_m) / scene.objects.size_lhw[row, 0]
         assert FeasibleSet(space).violations(theta) == ()
-    assert len(ways) > 1
+    assert len(directions) > 1
     assert moves.first_feasible(row, 2.5, np.random.default_rng(0)) is None
 
 
-def test_a_pasted_box_stands_where_the_new_one_does():
+def test_a_pasted_box_stands_where_the_new_one_does() -> None:
     picture = np.zeros((20, 30, 3), np.uint8)
     picture[5:11, 4:8] = 200
     pasted = people.paste(picture, np.array([4, 5, 7, 10]), np.array([24, 8, 29, 14]))
@@ -109,7 +111,9 @@ def test_a_pasted_box_stands_where_the_new_one_does():
 
 
 @pytest.mark.slow
-def test_the_command_compares_with_the_generator(tmp_path: Path, capsys, monkeypatch):
+def test_the_command_compares_with_the_generator(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     streets = tmp_path / "streets"
     words = [
         "synth",
@@ -147,7 +151,7 @@ def test_the_command_compares_with_the_generator(tmp_path: Path, capsys, monkeyp
         (["people", "--dataset", "kitti", "--root", "none"], "none"),
     ],
 )
-def test_wrong_options_are_one_line(words, message, capsys):
+def test_wrong_options_are_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 2
     error = capsys.readouterr().err
     assert message in error
