@@ -35,6 +35,8 @@ _SEAM = 0.06
 """Width of the border along which a person's fill takes the colours around it, in heights."""
 _NEAR_THIN = (1.0, 0.5)
 """Range around a person from which parts are copied, across and down, in heights."""
+_MAX_UNKNOWN = 0.8
+"""Share of that range, of the person and of all others, above which there is too little to copy."""
 _MAX_THIN_PX = 100
 """Height up to which a person's fill is searched at full size; the time grows with its area squared."""
 _BORDER_PX = 5
@@ -158,7 +160,9 @@ class BackgroundFill:
         across, down = (round(reach * (y1 - y0)) for reach in _NEAR_THIN)
         window = (slice(max(y0 - down, 0), y1 + down), slice(max(x0 - across, 0), x1 + across))
         inputs, hole = self._full.inputs, thin[window]
-        unknown = hole | (inputs.maps.person[window] > _PERSON_SHARE)
+        unknown = hole | inputs.excluded[window] | (inputs.maps.person[window] > _PERSON_SHARE)
+        if unknown.mean() > _MAX_UNKNOWN:
+            return filled
         height, width = hole.shape
         scale = min(1.0, _MAX_THIN_PX / (y1 - y0))
         size = (max(round(scale * width), 1), max(round(scale * height), 1))

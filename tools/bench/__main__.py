@@ -44,6 +44,7 @@ from tools.bench import (
     memory,
     moves,
     parts,
+    people,
     redraw,
     rivals,
     scale,
@@ -202,6 +203,23 @@ def _moves(config: BenchTool, console: Console) -> BenchResult:
     except DetectorError as error:
         raise UsageError.from_detector_error("--detector", "a detector", error) from error
     return _measured(moves, {"rows": [asdict(row) for row in rows], "summary": moves.summary(rows)})
+
+
+def _people(config: BenchTool, console: Console) -> BenchResult:
+    _on_cpu(config)
+    rows: list[people.PersonRow] = []
+    try:
+        for frame in people.measure(config, _sheets(config)):
+            rows += frame
+            console.print(f"{frame[0].frame}: {format_count(len(frame), 'person', 'people')}")
+    except DetectorError as error:
+        raise UsageError.from_detector_error("--detector", "a detector", error) from error
+    figures, generator = people.summary(rows), people.compare_with_generator(rows)
+    tables = [BenchTable(people.TITLE, people.COLUMNS, figures)]
+    if generator:
+        tables.append(BenchTable(people.GENERATOR_TITLE, people.GENERATOR_COLUMNS, generator))
+    fields = {"rows": [asdict(row) for row in rows], "summary": figures, "generator": generator}
+    return BenchResult({**fields, "method": people.METHOD}, tables)
 
 
 def _synth(config: BenchTool, console: Console) -> BenchResult:
@@ -431,6 +449,7 @@ _MEASURES: dict[str, Callable[[Any, Console], BenchResult]] = {
     "found": _found,
     "label-free": _label_free,
     "moves": _moves,
+    "people": _people,
     "redraw": _redraw,
     "weather": _weather,
     "foliage": _foliage,

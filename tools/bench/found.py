@@ -138,6 +138,9 @@ class SceneFolder:
         if not self._names:
             raise FormatError(str(folder), "scenes as drivesem derender writes them", "none")
 
+    def account(self) -> None:
+        return None
+
     def identifiers(self) -> Iterator[str]:
         return iter(self._names)
 
@@ -375,8 +378,13 @@ _CONTEXT, _PANEL_PX, _GAP_PX = 0.5, 420, 6
 """Of a sheet: context around the boxes in their longer sides, height of a panel, gap."""
 
 
-def failure_sheet(before: CarView, after: CarView, row: int, caption: str) -> Picture:
-    """Photograph and edited picture around an object, side by side, without boxes above and with them below."""
+def failure_sheet(
+    before: CarView, after: CarView, row: int, caption: str, classes: Sequence[str] = (CAR,)
+) -> Picture:
+    """Photograph and edited picture around an object, side by side, without boxes above and with them below.
+
+    classes: names of detections that count.
+    """
     boxes = torch.stack([before.boxes_xyxy[row], after.boxes_xyxy[row]])
     x0, y0 = boxes[:, :2].amin(dim=0).tolist()
     x1, y1 = boxes[:, 2:].amax(dim=0).tolist()
@@ -391,13 +399,13 @@ def failure_sheet(before: CarView, after: CarView, row: int, caption: str) -> Pi
         plain = cv2.resize(cut, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         drawn = plain.copy()
         _draw(drawn, view.boxes_xyxy[row], _TRUE, "", (left, top, scale))
-        for names, colour in (((CAR,), _GIVEN), (VEHICLES[1:], _OTHER)):
+        for names, colour in ((classes, _GIVEN), (VEHICLES[1:], _OTHER)):
             found = view.named(names)
             near = iou_matrix(found.boxes_xyxy, boxes).amax(dim=1) > _NEAR_IOU
             found = Detections(found.boxes_xyxy[near], found.labels[near], found.scores[near])
             for box, score, label in zip(found.boxes_xyxy, found.scores, found.labels, strict=True):
-                caption = f"{view.classes[int(label)]} {float(score):.2f}"
-                _draw(drawn, box, colour, caption, (left, top, scale))
+                text = f"{view.classes[int(label)]} {float(score):.2f}"
+                _draw(drawn, box, colour, text, (left, top, scale))
         panels.append(np.concatenate([plain, drawn]))
     gap = np.full((panels[0].shape[0], _GAP_PX, 3), PAPER_COLOUR, np.uint8)
     picture = np.concatenate([panels[0], gap, panels[1]], axis=1)

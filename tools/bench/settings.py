@@ -7,7 +7,14 @@ from functools import partial
 from typing import Annotated, Literal
 
 from drivesem.config.commands import MIN_PASSES, BenchOptions
-from drivesem.config.constraints import NumberRange, OneOf, ParsedBy, at_least, parse_integers
+from drivesem.config.constraints import (
+    NumberRange,
+    OneOf,
+    ParsedBy,
+    at_least,
+    parse_attributes,
+    parse_integers,
+)
 from drivesem.config.errors import refuse
 from drivesem.config.options import (
     DEMO,
@@ -32,7 +39,8 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     of de-rendering, with a fit and with --fast; depth: depth of the surroundings against the generator's truth, a
     laser, and in fog; found: whether a detector still finds removed cars, and finds moved ones; label-free:
     vehicles of photographs with hidden labels against those labels; moves: cars moved farther and farther, against
-    the generator's truth; redraw: the second renderer of photographs against the photograph and the compositor;
+    the generator's truth; people: whether a detector finds people where they were moved, and not where they were;
+    redraw: the second renderer of photographs against the photograph and the compositor;
     weather, foliage: the compositor against the generator; synth: the scene generator; rivals: other renderers
     against the project's; devices: a GPU (--device) against the processor; eval: drivesem eval of many frames
     against pycocotools; viewer: response time of drivesem view to a slider; install: megabytes and seconds from a
@@ -46,7 +54,7 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     frames: int | None = None
     """Frames: generated per row by synth (default: 200, with --quick 40); de-rendered by derender (100, 12); used by
     moves (80, 6), depth (40, 6), weather and foliage (24, 4), devices (12, 2), label-free and parts (60, 12), or
-    evaluated by eval (20,000, 1,000)."""
+    evaluated by eval (20,000, 1,000); people: with somebody who moves (default: all)."""
     ablate: Flag = False
     """derender: also with labels, masks, geometry, mattes or background from the generator."""
     fast: Flag = False
@@ -54,14 +62,16 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
     threads: Count | None = None
     """Threads of torch and of the kernels (default: torch's choice)."""
     detector: str = "squeezedet"
-    """devices, found, moves, redraw, weather, viewer: a shipped detector, a .safetensors file of one, or onnx:FILE.
-    paths: detectors of any kind, with commas."""
+    """devices, found, moves, people, redraw, weather, viewer: a shipped detector, a .safetensors file of one, or
+    onnx:FILE. paths: detectors of any kind, with commas."""
     dataset: Annotated[str, OneOf(SOURCES)] = DEMO
-    """found, label-free, parts, redraw, depth: demo (generated scenes; needs no data), kitti, vkitti1, vkitti2, coco
-    or yolo."""
+    """found, label-free, parts, people, redraw, depth: demo (generated scenes; needs no data), kitti, vkitti1,
+    vkitti2, coco or yolo."""
     root: str | None = None
-    """found, label-free, parts, redraw, depth: folder of the data set, such as KITTI's with training/image_2,
-    label_2, calib."""
+    """found, label-free, parts, people, redraw, depth: folder of the data set, such as KITTI's with
+    training/image_2, label_2, calib."""
+    where: Annotated[str, ParsedBy(parse_attributes)] | None = None
+    """people: frames with these attributes, such as timeofday=daytime."""
     scenes: str | None = None
     """Folder of scenes written by drivesem derender. found, redraw: instead of a data set; depth: in addition to one;
     viewer: the first one is moved (default: an embedded scene)."""
@@ -74,6 +84,8 @@ class BenchTool(TileOption, DataSourceOptions, FrameCommandConfig):
         few = self.frames is not None and self.frames < fewest
         refuse(few, "--frames", f"at least {fewest}", self.frames)
         refuse(self.fast and self.what != "derender", "--fast", "the benchmark derender", self.what)
+        refuse(self.where is not None and self.what != "people", "--where", "the benchmark people", self.what)
+        refuse(self.what == "people" and self.dataset == DEMO, "--dataset", "a data set with people", self.dataset)
         both = self.what != "depth" and self.scenes is not None and self.dataset != DEMO
         refuse(both, "--scenes", "no --dataset", f"--dataset {self.dataset}")
 

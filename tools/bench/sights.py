@@ -53,7 +53,7 @@ class CarView:
     detections: Detections
     classes: tuple[str, ...]
     assigned: list[DetectorSight]
-    """What was given to each object, as a car."""
+    """What was given to each object, as a car or the names of its view."""
 
     def sight(self, row: int, names: Sequence[str], score: float = SCORE) -> DetectorSight:
         """Best overlap with an object's box of all detections of its class, also those of other objects."""
@@ -89,8 +89,9 @@ class CarView:
 class DetectorView:
     """A detector for pictures as they are written to files."""
 
-    def __init__(self, predictor: Predictor) -> None:
-        self._predictor = predictor
+    def __init__(self, predictor: Predictor, names: Sequence[str] = (CAR,), score: float = SCORE) -> None:
+        """names: classes of the detections that are assigned to objects; score: what these exceed."""
+        self._predictor, self._names, self._score = predictor, names, score
 
     def view_cars(self, image: Tensor, boxes_xyxy: Tensor) -> CarView:
         """image (3, H, W) in [0, 1]; boxes (N, 4) px of the objects in it."""
@@ -98,7 +99,7 @@ class DetectorView:
         given = torch.from_numpy(picture.transpose(2, 0, 1).copy()).float() / 255
         found = predict(self._predictor, given[None])[0]
         view = CarView(picture, boxes_xyxy, found, self._predictor.classes, [])
-        return replace(view, assigned=assign(boxes_xyxy, view.named((CAR,))))
+        return replace(view, assigned=assign(boxes_xyxy, view.named(self._names, self._score)))
 
 
 def assign(boxes_xyxy: Tensor, detections: Detections) -> list[DetectorSight]:

@@ -57,8 +57,9 @@ def test_only_the_hole_is_filled_and_from_the_street(street, shrink: int) -> Non
     assert np.array_equal(behind.fill_hole(hole, 0), behind.fill_hole(hole, 0))
 
 
+@pytest.mark.parametrize("labelled", [False, True])
 @pytest.mark.parametrize("tall", [60, 150])
-def test_behind_a_person_what_is_near_goes_on_and_nobody_is_copied(street, tall: int) -> None:
+def test_behind_a_person_what_is_near_goes_on_and_nobody_is_copied(street, tall: int, labelled: bool) -> None:
     around, shape = surroundings(street), street.mask.shape
     stripes = np.broadcast_to((np.arange(shape[0]) // 8 % 2)[:, None, None], (*shape, 3))
     wall = (0.3 + 0.4 * stripes).astype(np.float32)
@@ -68,12 +69,24 @@ def test_behind_a_person_what_is_near_goes_on_and_nobody_is_copied(street, tall:
     image = np.where(person[..., None], (0.9, 0.1, 0.1), wall)
     image = np.where(other[..., None] > 0, (0.1, 0.9, 0.1), image).astype(np.float32)
     inputs = replace(around, maps=replace(around.maps, person=other))
+    if labelled:
+        inputs = replace(around, excluded=around.excluded | (other > 0))
     behind = BackgroundFill(image, np.full(shape, 9.0, np.float32), inputs)
     found = behind.fill_thin(image, person)
     assert np.array_equal(found[~person], image[~person])
     assert np.array_equal(found, behind.fill_thin(image, person)), "the same again"
     assert np.abs(found - wall)[person].mean() < 0.06
     assert np.ptp(found[person], axis=1).max() < 0.1, "grey, as the wall"
+
+
+def test_a_crowd_has_nothing_to_copy(street) -> None:
+    around, shape = surroundings(street), street.mask.shape
+    person = np.zeros(shape, bool)
+    person[10:70, 200:220] = True
+    inputs = replace(around, excluded=np.ones(shape, bool))
+    image = np.full((*shape, 3), 0.5, np.float32)
+    behind = BackgroundFill(image, np.full(shape, 9.0, np.float32), inputs)
+    assert np.array_equal(behind.fill_thin(image, person), image)
 
 
 def test_one_is_the_photographs_own_size(street) -> None:
