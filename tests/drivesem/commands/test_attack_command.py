@@ -276,7 +276,7 @@ def test_failures_have_kinds_and_grades(tmp_path: Path, monkeypatch: pytest.Monk
     timid = Timid()
     monkeypatch.setattr(run_attack, "load_predictor", lambda *_: timid)
     words = ["attack", "--detector", "any", "--limit", "1", "--workers", "1", "--params", "weather"]
-    words += ["--method", "random", "--queries", "8", "--nuisances", "off", "--budget", "weather=0.2"]
+    words += ["--method", "random", "--queries", "8", "--nuisances", "off", "--budget", "weather=0.3"]
     metrics = run_json(*words, "--out", tmp_path / "run")
     grades, kinds = metrics["grades"], metrics["kinds"]
     assert list(grades) == ["threshold", "certain", "confirmed", "shared"]
