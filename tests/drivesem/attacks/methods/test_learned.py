@@ -26,6 +26,16 @@ class BlindSpot(Street):
         return torch.where(distance < RADIUS, -3.0, 3.0) + 0 * theta.sum()
 
 
+@dataclass
+class Uniform(Street):
+    """The margin is the same everywhere."""
+
+    margin: float = 0.0
+
+    def known_margins(self, theta: Tensor, number: int) -> Tensor:
+        return self.margin + 0 * theta[:CARS]
+
+
 def spot_rows(count: int = 2000) -> np.ndarray:
     """Rows of earlier frames, in which the same region was met now and then."""
     features = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) * 3 - 1.5
@@ -47,21 +57,18 @@ def test_what_earlier_frames_met_is_found_in_fewer_passes() -> None:
     assert knowing[1] < blind[1]
 
 
-def test_rounds_go_on_for_cars_that_are_neither_lost_nor_beyond_hope() -> None:
-    lost_everywhere, safe = Street(), Street()
-    lost_everywhere.known_margins = lambda theta, number: torch.full((CARS,), -3.0)  # pyright: ignore
-    safe.known_margins = lambda theta, number: torch.full((CARS,), 5.0)  # pyright: ignore
+def test_a_search_ends_early_where_cars_are_lost_or_beyond_hope() -> None:
     never = np.concatenate([spot_rows()[:, :-1], np.full((2000, 1), 5.0, np.float32)], 1)
-    passes = []
-    for street, rows in ((lost_everywhere, None), (safe, None), (safe, never), (safe, spot_rows())):
-        before = street.passes
+
+    def passes(margin: float, rows: np.ndarray | None) -> int:
+        street = Uniform(margin=margin)
         Learn(90, model=None if rows is None else MarginModel(rows))(street.problem(), START, 0)
-        passes.append(street.passes - before)
-    lost_early, without_model, hopeless, hopeful = passes
-    assert lost_early < 50  # it is lost in two nuisance samples: no other round
-    assert hopeless < 40  # no tree predicts that it can be lost
-    assert without_model > 70  # what no model has seen is searched in full
-    assert hopeful > 70
+        return street.passes
+
+    assert passes(-3, None) == 20  # 16 points, and the best one in four nuisance samples
+    assert passes(5, never) == 20  # no tree predicts that a car can be lost
+    assert passes(5, None) > 70  # what no model has seen is searched in full
+    assert passes(5, spot_rows()) > 70
 
 
 @pytest.mark.parametrize("passes", [24, 41])
