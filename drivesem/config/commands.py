@@ -112,7 +112,7 @@ class AttackConfig(TileOption, GradingOptions, TargetClassesOption, SceneAttackO
     method: Literal[SearchMethod, "placebo"] = "si-fgsm"
     """Search method; climb, corners and learn look for failures that hold; placebo makes a random edit (--like)."""
     passes: Annotated[Count, at_least(MIN_PASSES, "which the search needs")] | None = None
-    """Detector passes per frame (learn: in the mean; a gradient counts as 3); climb, corners, learn: 90 by default."""
+    """Detector passes per frame (a gradient counts as 3); climb, corners and learn take 90 by default."""
     queries: Annotated[Count, OnlyWith("method", QUERY_METHODS)] | None = None
     """Query budget: gradients for scw, evaluated renders for gradient-free methods (default: 64)."""
     step_form: Annotated[Literal["raw", "l2"], OnlyWith("method", ("sgd",))] = "l2"

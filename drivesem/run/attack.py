@@ -57,7 +57,7 @@ from drivesem.run.labels import RESULT
 from drivesem.run.records import from_json
 from drivesem.run.results import FrameResult, RunSummary, load_frame
 from drivesem.run.run_report import write_run_report
-from drivesem.run.search_memory import SearchedFrame, SearchMemory
+from drivesem.run.search_memory import SearchMemory
 from drivesem.scenes.sources import NoVehicleError, SceneSource, compile_source_kernels, open_source
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError, SceneError, ShapeError
@@ -340,12 +340,6 @@ class AttackWorker:
         config = _resolve_budget(config)
         return replace(self, config=config, params=resolve_parameters(config), method=build_attack(config))
 
-    def with_memory(self, memory: SearchMemory) -> AttackWorker:
-        """The same with what `learn` knows of finished frames, for the next one."""
-        assert isinstance(self.method, Learn)
-        passes = memory.allowance(self.method.passes)
-        return replace(self, method=Learn(passes, model=memory.model()))
-
     def attack_frame(self, identifier: str, out: Path) -> bool:
         """Attack a frame of the source and write its folder; False where it has no vehicle to attack. The result
         stays on disk: a run has thousands of a quarter megabyte each.
@@ -353,7 +347,7 @@ class AttackWorker:
         worker = self
         if isinstance(self.method, Learn):
             self.memory.read(out / FRAMES)
-            worker = self.with_memory(self.memory)
+            worker = replace(self, method=replace(self.method, model=self.memory.model()))
         try:
             attacked = worker.attack_scene(identifier, self.source.scene(identifier))
         except NoVehicleError:
@@ -415,9 +409,7 @@ class AttackWorker:
             grade_notes=notes,
             passes=passes,
             visits=objective.cell_visits(evaluation),
-            searched=(
-                SearchedFrame(objective.search_log.margin_rows(), passes) if isinstance(method, Learn) else None
-            ),
+            margin_rows=objective.search_log.margin_rows() if isinstance(method, Learn) else None,
             seconds=end - start,
             grading_seconds=end - search_end,
         )

@@ -46,7 +46,7 @@ from drivesem.run.results import (
     VehicleCounts,
     dump_frame,
 )
-from drivesem.run.search_memory import MARGINS, SearchedFrame, write_searched_frame
+from drivesem.run.search_memory import MARGINS
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene, to_uint8
@@ -77,8 +77,8 @@ class AttackedScene:
     """Detector passes, a gradient counted as 3."""
     visits: tuple[CellVisit, ...]
     """Where in feature space the objects were evaluated."""
-    searched: SearchedFrame | None
-    """What the searches of other frames learn from; None where none does."""
+    margin_rows: np.ndarray | None
+    """(R, F + 1), features and margins for the searches of other frames; None where none reads them."""
     seconds: float
     """Total time."""
     grading_seconds: float
@@ -172,8 +172,8 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
             for c in result.theta
         },
     )
-    if attacked.searched is not None:
-        write_searched_frame(part / MARGINS, attacked.searched)
+    if attacked.margin_rows is not None:
+        files.write_npz(part / MARGINS, {"rows": attacked.margin_rows})
     files.write_text(part / RESULT, dump_frame(result))
 
 

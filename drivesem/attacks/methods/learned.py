@@ -78,7 +78,7 @@ class MarginModel:
 @dataclass(frozen=True, slots=True)
 class Learn(Climb):
     """`Climb` from a start that a model of finished frames proposes in part. It ends early where each object is lost
-    at the start, or has no chance by the model, so that other frames can have the passes.
+    at the start, or has no chance by the model.
     """
 
     model: MarginModel | None = None
