@@ -253,7 +253,7 @@ def balanced_corners(owner: Tensor, count: int, generator: torch.Generator) -> T
     return ends[rows[:count]].to(owner.device)
 
 
-START_SHARE = 0.4
+_START_SHARE = 0.4
 """Share of the passes that choose the start."""
 _DIFFERENCE_REACH = 0.2
 """Half the width of differences, as a share of the bounds."""
@@ -273,16 +273,18 @@ class Climb(MarginSearch):
     """Whether to use gradients where the detector has one."""
 
     def _search(self, search: MarginSearchState) -> Tensor:
-        start = _choose_start(search, sample_points(search, max(int(START_SHARE * self.passes), 1)))
-        return Descent(search, self._uses_gradient(search)).descend(start)
+        points = self._start_points(search, max(int(_START_SHARE * self.passes), 1))
+        start = _choose_start(search, *points)
+        return _Descent(search, self.gradient and search.oracle.differentiable).descend(start)
 
-    def _uses_gradient(self, search: MarginSearchState) -> bool:
-        return self.gradient and search.oracle.differentiable
+    def _start_points(self, search: MarginSearchState, count: int) -> tuple[Tensor, range]:
+        """Points (count, K) of which the start is made, and the places of those that are uniform in the box."""
+        return sample_points(search, count), range(1, count, 2)
 
 
-def _choose_start(search: MarginSearchState, points: Tensor) -> Tensor:
-    """The start u (K,): the best of the candidates that the points (C, K) of `sample_points` give."""
-    starts = search.candidates(points, range(1, len(points), 2))
+def _choose_start(search: MarginSearchState, points: Tensor, random: Collection[int]) -> Tensor:
+    """The start u (K,): the best of the candidates that the points (C, K) give."""
+    starts = search.candidates(points, random)
     number = search.next_sample()
     values = [search.objective(row) for row in search.margins(starts, [number] * len(starts))]
     return starts[min(range(len(starts)), key=values.__getitem__)]
@@ -302,7 +304,7 @@ def sample_points(search: MarginSearchState, count: int) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True)
-class Descent:
+class _Descent:
     """The descent from a start, with or without gradients."""
 
     search: MarginSearchState

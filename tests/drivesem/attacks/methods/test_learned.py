@@ -26,16 +26,6 @@ class BlindSpot(Street):
         return torch.where(distance < RADIUS, -3.0, 3.0) + 0 * theta.sum()
 
 
-@dataclass
-class Uniform(Street):
-    """The margin is the same everywhere."""
-
-    margin: float = 0.0
-
-    def known_margins(self, theta: Tensor, number: int) -> Tensor:
-        return self.margin + 0 * theta[:CARS]
-
-
 def spot_rows(count: int = 2000) -> np.ndarray:
     """Rows of earlier frames, in which the same region was met now and then."""
     features = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) * 3 - 1.5
@@ -43,32 +33,23 @@ def spot_rows(count: int = 2000) -> np.ndarray:
     return torch.cat([features, margins[:, None]], 1).numpy()
 
 
-def lost(method: Climb | Learn, seed: int) -> tuple[int, int]:
+def lost(method: Climb, seed: int) -> int:
     street = BlindSpot()
     theta = method(street.problem(), START, seed).theta
-    return int((street.known_margins(theta, 0) < 0).sum()), street.passes
+    return int((street.known_margins(theta, 0) < 0).sum())
 
 
 def test_what_earlier_frames_met_is_found_in_fewer_passes() -> None:
     seeds = range(6)
-    blind = np.sum([lost(Climb(passes=60), seed) for seed in seeds], 0)
-    knowing = np.sum([lost(Learn(passes=60, model=MarginModel(spot_rows())), seed) for seed in seeds], 0)
-    assert knowing[0] >= blind[0] + 4  # of 24 cars
-    assert knowing[1] < blind[1]
+    blind = sum(lost(Climb(passes=30), seed) for seed in seeds)
+    knowing = sum(lost(Learn(passes=30, model=MarginModel(spot_rows())), seed) for seed in seeds)
+    assert knowing >= blind + 4
 
 
-def test_a_search_ends_early_where_cars_are_lost_or_beyond_hope() -> None:
-    never = np.concatenate([spot_rows()[:, :-1], np.full((2000, 1), 5.0, np.float32)], 1)
-
-    def passes(margin: float, rows: np.ndarray | None) -> int:
-        street = Uniform(margin=margin)
-        Learn(90, model=None if rows is None else MarginModel(rows))(street.problem(), START, 0)
-        return street.passes
-
-    assert passes(-3, None) == 20  # 16 points, and the best one in four nuisance samples
-    assert passes(5, never) == 20  # no tree predicts that a car can be lost
-    assert passes(5, None) > 70  # what no model has seen is searched in full
-    assert passes(5, spot_rows()) > 70
+def test_without_a_model_it_is_climb() -> None:
+    for seed in range(2):
+        one, other = (method(Street().problem(), START, seed) for method in (Climb(40), Learn(40)))
+        assert torch.equal(one.theta, other.theta)
 
 
 @pytest.mark.parametrize("passes", [24, 41])
@@ -87,10 +68,9 @@ def test_objects_that_do_not_count_are_left_out_of_predictions() -> None:
 def test_points_that_the_model_proposes_are_not_random() -> None:
     one, other = BlindSpot(), BlindSpot()
     Learn(60, model=MarginModel(spot_rows()))(one.problem(), START, 0)
-    Learn(60)(other.problem(), START, 0)
-    assert len(one.random) == 4  # of 16 at the start, 8 of the model
-    assert len(other.random) == 8
-    distances = [min(float((theta - start).norm()) for start in one.thetas[:8:2]) for theta in one.random]
+    Learn(60, model=MarginModel(1 - spot_rows()))(other.problem(), START, 0)
+    assert len(one.random) == len(other.random) == 6  # of 24 at the start, 12 of the model
+    distances = [min(float((theta - start).norm()) for start in one.thetas[:12]) for theta in one.random]
     assert min(distances) > 0
 
 
