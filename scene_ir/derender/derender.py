@@ -63,6 +63,8 @@ _CATEGORIES = VEHICLE_CATEGORIES | people.PEOPLE_CATEGORIES
 
 _MIN_SIDE_PX = 16
 """Smallest side of a photograph: maps are computed at an eighth of its size."""
+_MAX_BEHIND_EGO = 0.02
+"""Share of a person that the ego vehicle may hide."""
 _MAX_LABELS = 500
 """Labels of a frame: each vehicle takes megabytes and a second."""
 _FADE = (0.08, 0.45)
@@ -162,8 +164,8 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     # Vehicles and people, and what stands in front of them.
     ego_mask = _find_ego_vehicle(frame, image)
     rows = [rows[i] for i in ego.boxes_outside(ego_mask, labels.boxes_xyxy[rows])]
-    persons, left_out = _cut_out_people(frame, image, ground, settings)
-    occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask, [person.row for person in persons])
+    persons, left_out = _cut_out_people(frame, image, ground, settings, ego_mask)
+    occluder_masks = _find_labelled_occluders(frame, image, rows, ego_mask, persons)
     in_front = occluder_masks + [OccluderMask(p.mask, _depth_m(p.placement, camera)) for p in persons]
     cuts = _cut_out_vehicles(image, frame, rows, settings, in_front)
     cuts = sorted([*cuts, *_place_people(persons, cuts, settings, camera)], key=lambda cut: cut.row)
@@ -316,20 +318,30 @@ def _find_ego_vehicle(frame: Frame, image: Array) -> Mask | None:
 
 
 def _find_labelled_occluders(
-    frame: Frame, image: Array, rows: list[int], ego_mask: Mask | None, persons: Sequence[int] = ()
+    frame: Frame,
+    image: Array,
+    rows: list[int],
+    ego_mask: Mask | None,
+    persons: Sequence[people.PersonCutout] = (),
 ) -> list[OccluderMask]:
-    """The ego vehicle, if it is visible, then people and the like in front of objects, by their labels; without those
-    in the rows `persons`, which are objects.
+    """The ego vehicle, if it is visible, then people and the like in front of objects, by their labels; without
+    `persons`, which are objects, and without the pixels of those who stand nearer.
     """
     labels = frame.labels
     assert labels is not None
-    unmoved = set(_posed_rows(labels)).difference(persons)
+    cut_out = [person.row for person in persons]
+    unmoved = set(_posed_rows(labels)).difference(cut_out)
     others = [row for row in sorted(unmoved) if labels.kind[row] not in VEHICLE_CATEGORIES]
-    labelled = occluders.find_labelled_occluders(_to_uint8(image), frame, [*rows, *persons], others)
-    if ego_mask is None:
-        return labelled
-    rest = [replace(occluder, mask=occluder.mask & ~ego_mask) for occluder in labelled]
-    return [OccluderMask(ego_mask, ego.DEPTH_M), *(occluder for occluder in rest if occluder.mask.any())]
+    labelled = occluders.find_labelled_occluders(_to_uint8(image), frame, [*rows, *cut_out], others)
+    nearer = [(person.mask, _depth_m(person.placement, frame.camera)) for person in persons]
+    found = [] if ego_mask is None else [OccluderMask(ego_mask, ego.DEPTH_M)]
+    for occluder in labelled:
+        taken = [other.mask for other in found[:1] if ego_mask is not None]
+        taken += [mask for mask, depth_m in nearer if depth_m < occluder.depth_m]
+        rest = occluder.mask & ~_union(taken, occluder.mask.shape)
+        if rest.any():
+            found.append(replace(occluder, mask=rest))
+    return found
 
 
 def _find_unlabelled_occluders(
@@ -347,12 +359,17 @@ def _find_unlabelled_occluders(
 
 
 def _cut_out_people(
-    frame: Frame, image: Array, ground: torch.Tensor, settings: DerenderSettings
+    frame: Frame, image: Array, ground: torch.Tensor, settings: DerenderSettings, ego_mask: Mask | None
 ) -> tuple[list[people.PersonCutout], dict[int, str]]:
     """The people that become objects, if any may, and by row why others stay in the background."""
     if not settings.people or frame.labels is None:
         return [], {}
-    return people.cut_out_people(_to_uint8(image), frame, _posed_rows(frame.labels), ground, settings.backend)
+    rows = _posed_rows(frame.labels)
+    persons, reasons = people.cut_out_people(_to_uint8(image), frame, rows, ground, settings.backend)
+    if ego_mask is not None:
+        behind = [p.row for p in persons if np.mean(ego_mask[p.mask]) > _MAX_BEHIND_EGO]
+        reasons |= dict.fromkeys(behind, "behind the ego vehicle")
+    return [person for person in persons if person.row not in reasons], reasons
 
 
 def _place_people(

@@ -279,6 +279,32 @@ def test_who_cannot_be_cut_out_whole_stays_background_with_a_reason(crossing, st
     assert scene.provenance["labels[1].background"] == reason
 
 
+def test_who_stands_behind_the_own_bonnet_stays_background(crossing):
+    rows = np.flatnonzero((crossing.masks[1].numpy() > 0.5).any(1))
+    classes = torch.zeros(crossing.masks.shape[1:], dtype=torch.int64)
+    classes[rows[-8] :] = 1
+    frame = replace(crossing, classes=classes, class_names=("road", "ego vehicle"))
+    scene = derender(frame, DerenderSettings(fit=False, people=True))
+    assert Category.PEDESTRIAN not in scene.objects.category.tolist()
+    assert scene.provenance["labels[1].background"] == "behind the ego vehicle"
+
+
+def test_a_person_leaves_whole_though_the_mask_of_somebody_behind_covers_it(crossing, scene):
+    own = crossing.masks[1].numpy()
+    rows = np.flatnonzero((own > 0.5).any(1))
+    behind = own.copy()
+    behind[rows[0] + round(0.8 * len(rows)) :] = 0
+    far = torch.tensor([[PLACE[0], PLACE[1], PLACE[2] + 0.7]])  # nearer than the car
+    labels = label_person(crossing.labels, behind > 0.5, occlusion=[1], translation=far)
+    frame = replace(crossing, labels=labels, masks=torch.cat([crossing.masks, torch.from_numpy(behind)[None]]))
+    found = derender(frame, DerenderSettings(fit=False, people=True))
+    assert found.objects.category.tolist() == [Category.CAR, Category.PEDESTRIAN]
+    solid = torch.from_numpy(own > 0.9)
+    changed = (found.background - found.photograph).abs().amax(0)[solid]
+    usual = (scene.background - scene.photograph).abs().amax(0)[solid]
+    assert float((changed > 0.02).double().mean()) > 0.9 * float((usual > 0.02).double().mean()) > 0.5
+
+
 def test_people_who_overlap_stay_background(crossing):
     twice = label_person(crossing.labels, crossing.masks[1].numpy() > 0.5)
     masks = torch.cat([crossing.masks, crossing.masks[1:]])
