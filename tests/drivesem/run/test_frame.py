@@ -80,6 +80,16 @@ def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
     assert [model is None for model in models] == [True, True, True, True, False]
 
 
+def test_frames_with_the_same_objects_draw_different_states() -> None:
+    config = AttackConfig(params="translate", method="random", queries=2, grade=False)
+    worker = AttackWorker.from_config(config, load_detector("squeezedet"))
+    scene = demo_scene(0, 0)
+    one, again, other = (worker.attack_scene(name, scene).search for name in ("a", "a", "b"))
+    assert one.seed == again.seed != other.seed
+    assert torch.equal(one.theta, again.theta)
+    assert not torch.equal(one.theta, other.theta)
+
+
 def sampled(found: tuple[int, ...], *visits: tuple[int, int, int]) -> Any:
     """A frame, and its visits as object, random states and misses in them, with others; all in one cell."""
     counts = [CellVisit(index, (0, 0, 0, 0), n + 5, m + 4, random=n, random_misses=m) for index, n, m in visits]
