@@ -79,7 +79,7 @@ def test_behind_a_person_what_is_near_goes_on_and_nobody_is_copied(street, tall:
     assert np.ptp(found[person], axis=1).max() < 0.1, "grey, as the wall"
 
 
-def test_a_crowd_has_nothing_to_copy(street) -> None:
+def test_a_crowd_has_no_known_parts_to_copy(street) -> None:
     around, shape = surroundings(street), street.mask.shape
     person = np.zeros(shape, bool)
     person[10:70, 200:220] = True

@@ -13,9 +13,8 @@ from drivesem.attacks.budgets import PRESETS
 from drivesem.attacks.feasible.projection import FeasibleSet
 from drivesem.attacks.space import ParameterSpace
 from drivesem.cli import main as drivesem
-from drivesem.synth.frames import plan_frame, render_frame
-from scene_ir.derender.derender import DerenderSettings, derender
-from scene_ir.types import Frame, SceneIR
+from scene_ir.types import SceneIR
+from tests.drivesem.generated_people import derender_generated_people
 from tests.tools.bench.test_bench_found import Rows, Told
 from tools.bench import people
 from tools.bench.__main__ import main
@@ -27,12 +26,7 @@ CLASSES = ("Car", "Pedestrian")
 
 @pytest.fixture(scope="module")
 def scene() -> SceneIR:
-    """A generated street with people on the pavement, cut out by the network."""
-    frame = render_frame(plan_frame(3, 0))
-    assert frame is not None
-    photograph = torch.from_numpy(frame.image.astype(np.float32) / 255).permute(2, 0, 1).contiguous()
-    found = Frame("generated", photograph, frame.camera, frame.labels)
-    return derender(found, DerenderSettings(fit=False, people=True))
+    return derender_generated_people()
 
 
 def answers_of(boxes: torch.Tensor) -> Rows:

@@ -5,21 +5,15 @@ import pytest
 import torch
 
 from drivesem.failures.second_renderer.selection import SecondRenderers
-from drivesem.synth.frames import plan_frame, render_frame
 from scene_ir.derender import upright
-from scene_ir.derender.derender import DerenderSettings, derender
 from scene_ir.render.compositor import Compositor
-from scene_ir.types import Frame, SceneIR
+from scene_ir.types import SceneIR
+from tests.drivesem.generated_people import derender_generated_people
 
 
 @pytest.fixture(scope="module")
 def scene() -> SceneIR:
-    """A generated street with people on the pavement, cut out by the network."""
-    frame = render_frame(plan_frame(3, 0))
-    assert frame is not None
-    photograph = torch.from_numpy(frame.image.astype(np.float32) / 255).permute(2, 0, 1).contiguous()
-    found = Frame("generated", photograph, frame.camera, frame.labels)
-    return derender(found, DerenderSettings(fit=False, people=True))
+    return derender_generated_people()
 
 
 def test_both_renderers_draw_a_moved_person_alike(scene, screen):
