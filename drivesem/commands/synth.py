@@ -38,6 +38,7 @@ def build_order(config: SynthConfig) -> Order:
         variations=parse_variations(config.variations or ("clone" if virtual else MIXED)),
         sequence=config.sequence or (_DRIVE_FRAMES if virtual else 1),
         people=not virtual if config.people is None else config.people,
+        varied_people=config.varied_people,
         cameras=config.cameras,
         validation=config.validation,
         night=config.night,

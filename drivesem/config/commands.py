@@ -444,6 +444,8 @@ class SynthConfig(FrameCommandConfig):
     """Frames per drive, at 10 per second, with tracks (default: 10 for Virtual KITTI, else 1)."""
     people: bool | None = None
     """Add pedestrians and cyclists (default: in all layouts but Virtual KITTI's)."""
+    varied_people: Flag = False
+    """Vary people: coats, skirts, hats, bags, children, people side by side, motorcycles."""
     cameras: Literal[1, 2] = 1
     """Number of cameras; 2 adds the right camera of Virtual KITTI 2."""
     validation: Annotated[float, NumberRange(0, 1, "[)", "a fraction in [0, 1)")] = 0.0
@@ -466,6 +468,8 @@ class SynthConfig(FrameCommandConfig):
         refuse(self.cameras == 2 and self.layout != "vkitti2", "--cameras", "1, or --layout vkitti2", self.cameras)
         no_people = f"False with --layout {self.layout}, which has no class for them"
         refuse(bool(self.people) and self.layout.startswith("vkitti"), "--people", no_people, True)
+        without = self.people is False or self.layout.startswith("vkitti")
+        refuse(self.varied_people and without, "--varied-people", "a data set with people", "one without")
 
 
 @dataclass(frozen=True, kw_only=True)

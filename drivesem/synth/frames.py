@@ -329,7 +329,7 @@ def plan_frame(
     road = plan_road(rng[1], layout.kinds)
     actors = place_vehicles(rng[1], road, layout)
     for _ in range(layout.crowd if layout.people else 0):
-        actors += place_people(rng[2], road, actors)
+        actors += place_people(rng[2], road, actors, layout.varied_people)
     light = draw_light(rng[3], view.up, settings.sunny)
     if settings.skies:
         light = _photographed_sky(light, settings, stream(seed, street, split, 16 * attempt + 6))

@@ -251,9 +251,9 @@ class Actor:
 @dataclass(frozen=True, slots=True)
 class LayoutSettings:
     """variants: (first, count) of the vehicle shapes to draw from. people: whether pedestrians and cyclists
-    appear. crowd: times as many people. vehicles: (fewest, most) to be seen a frame, or None for KITTI's
-    distribution. max_heavy: most trucks and buses. fleet: vehicles from files, used instead of the templates of
-    their type.
+    appear. varied_people: see `place_people`. crowd: times as many people. vehicles: (fewest, most) to be seen a
+    frame, or None for KITTI's distribution. max_heavy: most trucks and buses. fleet: vehicles from files, used
+    instead of the templates of their type.
     """
 
     variants: tuple[int, int] = (0, 100)
@@ -263,6 +263,7 @@ class LayoutSettings:
     kinds: tuple[str, ...] = field(default=ROAD_KINDS)
     fleet: tuple[VehicleMesh, ...] = ()
     crowd: int = 1
+    varied_people: bool = False
 
 
 def plan_road(rng: np.random.Generator, kinds: tuple[str, ...] = ROAD_KINDS) -> Road:
@@ -744,8 +745,18 @@ def _settle(rng: np.random.Generator, road: Road, settings: LayoutSettings, spot
     )
 
 
-def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor]) -> list[Actor]:
-    """Pedestrians on pavements (some crossing the road) and cyclists near the road's edge, clear of vehicles."""
+_CHILD_SHARE, _CHILD_M = 0.15, (1.05, 1.5)
+"""Share of children among varied pedestrians, and their height, m."""
+_TOGETHER_SHARE, _TOGETHER_M = 0.4, 0.9
+"""Share of varied pedestrians who walk next to the one before, and how far apart they are, m."""
+
+
+def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor], varied: bool = False) -> list[Actor]:
+    """Pedestrians on pavements (some crossing the road) and cyclists near the road's edge, clear of vehicles.
+
+    varied: children and people who walk side by side too, in the clothes and with the bags of `people.pedestrian`,
+    and riders of motorcycles.
+    """
     wanted = ["pedestrian"] * int(rng.choice([0, 1, 2, 3, 5, 8], p=[0.45, 0.2, 0.15, 0.1, 0.06, 0.04]))
     wanted += ["cyclist"] * int(rng.choice([0, 1, 2, 3], p=[0.62, 0.24, 0.1, 0.04]))
     if road.kind == "motorway":
@@ -772,12 +783,18 @@ def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor]) ->
                 d += float(rng.normal(0, 0.4))
                 yaw = road.yaw(s, side) + float(rng.normal(0, 0.15))
             height = float(rng.normal(1.75, 0.09))
+            if varied and kind == "pedestrian" and rng.random() < _CHILD_SHARE:
+                height = float(rng.uniform(*_CHILD_M))
             size = (0.85 if kind == "pedestrian" else 1.77, height, 0.65 if kind == "pedestrian" else 0.6)
             x, z = (float(v) for v in road.point(d, s))
+            if varied and kind == "pedestrian" and actors and rng.random() < _TOGETHER_SHARE:
+                (x, z), yaw = actors[-1].position_xz, actors[-1].yaw
+                x, z = x + _TOGETHER_M * float(np.sin(yaw)), z + _TOGETHER_M * float(np.cos(yaw))
             outline = footprint((x, z), yaw, size)
             if abs(x) < 0.85 * z and all(clearance(outline, o) > 0.2 for o in outlines):
                 outlines.append(outline)
                 yaw = float((yaw + np.pi) % (2 * np.pi) - np.pi)
-                actors.append(Actor(kind, 0, (x, z), yaw, size, (0.0, 0.0, 0.0), False, int(rng.integers(2**31))))
+                seed = int(rng.integers(2**31))
+                actors.append(Actor(kind, int(varied), (x, z), yaw, size, (0.0, 0.0, 0.0), False, seed))
                 break
     return actors

@@ -1,4 +1,8 @@
-"""Simple articulated people and cyclists for training scenes, built from tubes and balls."""
+"""Simple articulated people and riders for training scenes, built from tubes and balls.
+
+Varied people also wear coats, skirts, hats and long hair, carry bags, hold their arms in other ways, and ride
+motorcycles.
+"""
 
 from __future__ import annotations
 
@@ -60,14 +64,68 @@ def _body(hip: np.ndarray, lean: float, colours: tuple[np.ndarray, ...]) -> tupl
     return parts, hip + up * 0.5
 
 
-def pedestrian(rng: np.random.Generator) -> Soup:
+_HEAD = 0.71
+"""Height of the head's middle over the hip, m."""
+
+
+def _headwear(rng: np.random.Generator, hip: np.ndarray, lean: float, hair: np.ndarray) -> list[Soup]:
+    """Long hair, a cap, a hat, a hood, or none of them, on the head of `_body`."""
+    up = np.array([np.sin(lean), -np.cos(lean), 0.0])
+    head, cloth = hip + up * _HEAD + np.array([0.02, 0, 0]), _pick(_CLOTH, rng)
+    match int(rng.integers(5)):
+        case 0:
+            return [ball(head - up * 0.06 - np.array([0.06, 0, 0]), (0.07, 0.17, 0.1), Material.CLOTH, hair, 1)]
+        case 1:
+            peak = ball(head + up * 0.05 + np.array([0.1, 0, 0]), (0.08, 0.015, 0.07), Material.CLOTH, cloth, 0)
+            return [ball(head + up * 0.06, (0.11, 0.085, 0.095), Material.CLOTH, cloth, 1), peak]
+        case 2:
+            brim = ball(head + up * 0.06, (0.17, 0.02, 0.16), Material.CLOTH, cloth, 1)
+            return [ball(head + up * 0.09, (0.11, 0.08, 0.1), Material.CLOTH, cloth, 1), brim]
+        case 3:
+            return [ball(head - np.array([0.03, 0, 0]), (0.115, 0.145, 0.115), Material.CLOTH, cloth, 1)]
+        case _:
+            return []
+
+
+def _long_garment(rng: np.random.Generator, hip: np.ndarray, colours: tuple[np.ndarray, ...]) -> list[Soup]:
+    """A coat in the shirt's colour, or a skirt in the trousers', to somewhere between thigh and ankle; or neither."""
+    shirt, trousers = colours
+    kind = int(rng.integers(5))
+    if kind > 1:
+        return []
+    hem = hip + np.array([0, float(rng.uniform(0.2, 0.8)), 0])
+    radii = (0.155, float(rng.uniform(0.17, 0.27)))
+    return [stick(hip - np.array([0, 0.12, 0]), hem, radii, Material.CLOTH, (shirt, trousers)[kind], 10)]
+
+
+def _bags(rng: np.random.Generator, hip: np.ndarray, shoulder: np.ndarray, hands: list[np.ndarray]) -> list[Soup]:
+    """A rucksack, a bag at the hip, bags in one or both hands, or none."""
+    colour, kind, side = _pick(_CLOTH, rng), int(rng.integers(5)), float(rng.choice([-1.0, 1.0]))
+    if kind == 0:
+        radii = (float(rng.uniform(0.08, 0.17)), float(rng.uniform(0.18, 0.3)), 0.16)
+        return [ball(shoulder + np.array([-0.17, 0.22, 0]), radii, Material.CLOTH, colour, 1)]
+    if kind == 1:
+        bag = hip + np.array([float(rng.uniform(-0.15, 0.1)), float(rng.uniform(-0.05, 0.15)), side * 0.24])
+        strap = stick(shoulder - np.array([0, 0.03, side * 0.1]), bag, (0.012, 0.012), Material.CLOTH, colour, 4)
+        radii = (float(rng.uniform(0.1, 0.2)), float(rng.uniform(0.1, 0.18)), 0.06)
+        return [strap, ball(bag, radii, Material.CLOTH, colour, 1)]
+    if kind < 4:
+        held = hands if kind == 2 else [hands[int(rng.integers(2))]]
+        radii = (float(rng.uniform(0.1, 0.19)), float(rng.uniform(0.12, 0.22)), float(rng.uniform(0.04, 0.09)))
+        return [ball(hand + np.array([0, radii[1] + 0.05, 0]), radii, Material.CLOTH, colour, 1) for hand in held]
+    return []
+
+
+def pedestrian(rng: np.random.Generator, varied: bool = False) -> Soup:
     """A person 1.75 m tall facing +x, feet on the ground, standing or walking, in random clothes."""
     shirt, trousers, skin, hair = _pick(_CLOTH, rng), _pick(_CLOTH, rng), _pick(_SKIN, rng), _pick(_HAIR, rng)
     shoes = np.full(3, 0.03, np.float32)
     stride = float(rng.choice([0.08, 0.35, 0.5])) * float(rng.uniform(0.7, 1.1))
     hip = np.array([0.0, -0.93 + 0.10 * stride, 0.0])
-    parts, shoulder = _body(hip, float(rng.uniform(0.0, 0.12)), (shirt, skin, hair))
+    lean = float(rng.uniform(0.0, 0.12))
+    parts, shoulder = _body(hip, lean, (shirt, skin, hair))
     bare = rng.random() < 0.35
+    hands = []
     for side in (-1.0, 1.0):
         swing = side * stride
         start = hip + np.array([0, 0, side * 0.095])
@@ -75,21 +133,26 @@ def pedestrian(rng: np.random.Generator) -> Soup:
         parts += _limb(leg, (0.09, 0.062, 0.045), trousers)
         parts.append(ball(leg[-1] + np.array([0.06, 0.02, 0]), (0.13, 0.05, 0.05), Material.CLOTH, shoes, 1))
         start = shoulder + np.array([0, 0, side * 0.205])
-        arm = _swing(start, (-swing * 0.9, -swing * 0.9 + 0.3), (0.29, 0.27))
+        bend = float(rng.uniform(0.1, 2.2)) if varied and rng.random() < 0.5 else 0.3
+        arm = _swing(start, (-swing * 0.9, -swing * 0.9 + bend), (0.29, 0.27))
+        hands.append(arm[-1])
         parts += _limb(arm, (0.06, 0.048, 0.04), skin if bare else shirt)
         parts.append(ball(arm[-1], (0.05, 0.06, 0.04), Material.CLOTH, skin, 0))
-    if rng.random() < 0.3:
+    if varied:
+        parts += _headwear(rng, hip, lean, hair) + _long_garment(rng, hip, (shirt, trousers))
+        parts += _bags(rng, hip, shoulder, hands)
+    elif rng.random() < 0.3:
         parts.append(
             ball(shoulder + np.array([-0.16, 0.2, 0]), (0.11, 0.22, 0.15), Material.CLOTH, _pick(_CLOTH, rng))
         )
     return join(parts)
 
 
-def _wheel(centre: np.ndarray, radius: float) -> list[Soup]:
+def _wheel(centre: np.ndarray, radius: float, tyre: float = 0.022) -> list[Soup]:
     rubber, steel = np.full(3, 0.02, np.float32), np.full(3, 0.35, np.float32)
     angle = np.linspace(0, 2 * np.pi, 15)
     rim = centre + np.stack([np.cos(angle) * radius, np.sin(angle) * radius, np.zeros(15)], axis=1)
-    parts = [stick(a, b, (0.022, 0.022), Material.CLOTH, rubber, 5) for a, b in pairwise(rim)]
+    parts = [stick(a, b, (tyre, tyre), Material.CLOTH, rubber, 5) for a, b in pairwise(rim)]
     spokes = rim[:-1:2]
     return parts + [stick(centre, s, (0.006, 0.006), Material.METAL, steel, 3) for s in spokes]
 
@@ -118,15 +181,53 @@ def bicycle(rng: np.random.Generator) -> Soup:
     return join([*parts, *_wheel(back, 0.33), *_wheel(front, 0.33)])
 
 
-def cyclist(rng: np.random.Generator) -> Soup:
-    """A person riding a bicycle along +x, wheels on the ground, 1.75 m tall in all."""
+def motorcycle(rng: np.random.Generator) -> Soup:
+    """A motorcycle or scooter about 2 m long along x, wheels on the ground."""
+    paint, dark, steel = _pick(_CLOTH, rng), np.full(3, 0.03, np.float32), np.full(3, 0.4, np.float32)
+    radius = float(rng.uniform(0.22, 0.32))
+    back, front = np.array([-0.66, -radius, 0.0]), np.array([0.66, -radius, 0.0])
+    bar = np.array([0.40, -1.02, 0])
+    parts = [
+        ball(np.array([0.12, -0.78, 0]), (0.3, 0.15, 0.15), Material.CLOTH, paint, 1),
+        ball(np.array([-0.35, -0.74, 0]), (0.42, 0.08, 0.14), Material.CLOTH, dark, 1),
+        ball(np.array([0.0, -0.42, 0]), (0.33, 0.24, 0.17), Material.CLOTH, dark, 1),
+        ball(np.array([0.48, -0.86, 0]), (0.11, 0.12, 0.13), Material.CLOTH, paint, 1),
+        stick(np.array([-0.02, -0.45, 0]), back, (0.07, 0.05), Material.CLOTH, dark, 6),
+        stick(bar, front, (0.045, 0.045), Material.CLOTH, dark, 6),
+        stick(
+            bar - np.array([0.05, 0, 0.33]), bar + np.array([-0.05, 0, 0.33]), (0.018,) * 2, Material.CLOTH, dark
+        ),
+        stick(np.array([0.0, -0.3, 0.18]), np.array([-0.75, -0.38, 0.2]), (0.05, 0.06), Material.METAL, steel, 6),
+    ]
+    if rng.random() < 0.4:
+        parts.append(ball(np.array([0.3, -0.5, 0]), (0.08, 0.38, 0.2), Material.CLOTH, paint, 1))  # leg shield
+    if rng.random() < 0.3:
+        parts.append(ball(np.array([-0.75, -0.95, 0]), (0.18, 0.16, 0.19), Material.CLOTH, dark, 1))  # top box
+    return join([*parts, *_wheel(back, radius, 0.055), *_wheel(front, radius, 0.055)])
+
+
+def cyclist(rng: np.random.Generator, varied: bool = False) -> Soup:
+    """A person riding a bicycle, or if varied perhaps a motorcycle, along +x, wheels on the ground, 1.75 m tall."""
     shirt, trousers, skin, hair = _pick(_CLOTH, rng), _pick(_CLOTH, rng), _pick(_SKIN, rng), _pick(_HAIR, rng)
-    hip = np.array([-0.2, -0.97, 0.0])
-    parts, shoulder = _body(hip, float(rng.uniform(0.3, 0.65)), (shirt, skin, hair))
+    motor = varied and rng.random() < 0.35
+    hip = np.array([-0.2, -0.86 if motor else -0.97, 0.0])
+    lean = float(rng.uniform(0.0, 0.4) if motor else rng.uniform(0.3, 0.65))
+    parts, shoulder = _body(hip, lean, (shirt, skin, hair))
+    if motor:
+        head = hip + _HEAD * np.array([np.sin(lean), -np.cos(lean), 0]) + np.array([0.02, 0, 0])
+        parts.append(ball(head, (0.14, 0.15, 0.125), Material.CLOTH, _pick(_CLOTH, rng), 1))
+    elif varied:
+        parts += _headwear(rng, hip, lean, hair)
+    if varied and rng.random() < 0.3:
+        parts.append(
+            ball(shoulder + np.array([-0.2, 0.1, 0]), (0.14, 0.2, 0.16), Material.CLOTH, _pick(_CLOTH, rng), 1)
+        )
     phase = float(rng.uniform(0, 2 * np.pi))
     for side in (-1.0, 1.0):
         angle = phase if side > 0 else phase + np.pi
         foot = np.array([-0.06 + 0.16 * np.cos(angle), -0.27 + 0.16 * np.sin(angle), side * 0.11])
+        if motor:
+            foot = np.array([0.02, -0.27, side * 0.22])
         start = hip + np.array([0.03, 0.02, side * 0.1])
         middle = (start + foot) / 2
         bend = np.sqrt(max(0.44**2 - float(((foot - start) ** 2).sum()) / 4, 0.0025))
@@ -135,8 +236,8 @@ def cyclist(rng: np.random.Generator) -> Soup:
         parts.append(
             ball(foot + np.array([0.05, 0.02, 0]), (0.12, 0.045, 0.045), Material.CLOTH, trousers * 0.3, 1)
         )
-        hand = np.array([0.35, -1.0, side * 0.24])
+        hand = np.array([0.35, -1.02 if motor else -1.0, side * (0.31 if motor else 0.24)])
         start = shoulder + np.array([0, 0, side * 0.19])
         elbow = (start + hand) / 2 + np.array([-0.02, 0.1, side * 0.04])
         parts += _limb([start, elbow, hand], (0.06, 0.048, 0.04), shirt)
-    return join([bicycle(rng), *parts])
+    return join([motorcycle(rng) if motor else bicycle(rng), *parts])

@@ -657,7 +657,7 @@ def actor_soup(actor: Actor, owner: int, distance_m: float = 0.0) -> Soup:
     """
     if actor.label in ("Pedestrian", "Cyclist"):
         rng = np.random.default_rng([0x9E0, actor.seed])
-        figure = people.pedestrian(rng) if actor.kind == "pedestrian" else people.cyclist(rng)
+        figure = (people.pedestrian if actor.kind == "pedestrian" else people.cyclist)(rng, actor.variant > 0)
         scale = actor.size_lhw[1] / 1.75
         soup = placed(figure, (0, 0, 0), 0.0, (scale, scale, scale))
     else:

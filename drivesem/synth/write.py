@@ -61,10 +61,10 @@ cluster's."""
 class Order:
     """What to make. out: folder; frames: how many streets' frames, each in every one of `variations` (Virtual
     KITTI's names, or "mixed": weather of its own). layout: of `drivesem.data.registry.WRITERS`. split: pool of
-    shapes, "train" or "heldout". sequence: frames of one drive. people: pedestrians and cyclists too. cameras: 2
-    for Virtual KITTI 2's stereo. validation: share of the frames that belong to part "val", made of held-out
-    shapes. night: share of the streets drawn by night. edits: a YAML file of `drivesem.synth.edits`. meshes, assets:
-    folders of vehicles, of the optional pack.
+    shapes, "train" or "heldout". sequence: frames of one drive. people: pedestrians and cyclists too.
+    varied_people: as of `layout.place_people`. cameras: 2 for Virtual KITTI 2's stereo. validation: share of the
+    frames that belong to part "val", made of held-out shapes. night: share of the streets drawn by night. edits: a
+    YAML file of `drivesem.synth.edits`. meshes, assets: folders of vehicles, of the optional pack.
     """
 
     out: Path
@@ -75,6 +75,7 @@ class Order:
     variations: tuple[str, ...] = (MIXED,)
     sequence: int = 1
     people: bool = True
+    varied_people: bool = False
     cameras: int = 1
     validation: float = 0.0
     night: float = 0.0
@@ -99,6 +100,8 @@ class Order:
             raise RangeError("synth cameras", "1, or 2 in layout vkitti2", self.cameras)
         if self.people and self.layout.startswith("vkitti"):
             raise RangeError("synth people", f"none in layout {self.layout}, which has no class for them", "some")
+        if self.varied_people and not self.people:
+            raise RangeError("synth varied_people", "none without people", "some")
         parse_variations(",".join(self.variations))
         _read_edits(self.edits)
         vehicles = _pack(self.meshes, self.assets).vehicles
@@ -112,9 +115,10 @@ class Order:
         """What decides on every byte of a frame; runs with another recipe do not go on in the same folder."""
         recipe = {k: v for k, v in asdict(self).items() if k not in ("out", "frames", "resume")}
         recipe["variations"] = list(self.variations)
-        if not self.night:
-            # as in recipes from before there was a night
-            del recipe["night"]
+        for name in ("night", "varied_people"):
+            if not recipe[name]:
+                # as in recipes from before there was such an option
+                del recipe[name]
         if self.edits is not None:
             recipe["edits"] = hashlib.sha256(files.read_bytes(self.edits)).hexdigest()
         for name in ("meshes", "assets"):
@@ -218,7 +222,12 @@ def plan_job(job: Job) -> Plan:
     split = "heldout" if job.place.part == "val" else order.split
     pack = _pack(order.meshes, order.assets)
     settings = SynthSettings(
-        layout=LayoutSettings(variants=VARIANTS[split], people=order.people, fleet=of_split(pack.vehicles, split)),
+        layout=LayoutSettings(
+            variants=VARIANTS[split],
+            people=order.people,
+            fleet=of_split(pack.vehicles, split),
+            varied_people=order.varied_people,
+        ),
         skies=tuple(sky for sky in pack.skies if sky.split == split),
         sunny=job.variation != MIXED,
         camera=order.layout if order.layout in ("vkitti1", "vkitti2") else None,

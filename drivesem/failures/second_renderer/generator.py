@@ -132,6 +132,7 @@ def _order(root: Path, manifest: Mapping[str, Any]) -> Order:
         frames=len(manifest["frames"]) // len(variations),
         variations=variations,
         night=manifest.get("night", 0.0),
+        varied_people=manifest.get("varied_people", False),
         **{
             key: manifest[key]
             for key in ("seed", "layout", "split", "sequence", "people", "cameras", "validation")

@@ -126,6 +126,10 @@ REFUSALS = [
     ("synth --night 1.5", "--night: expected a fraction in [0, 1], found 1.5"),
     ("synth --cameras 2", "--cameras: expected 1, or --layout vkitti2, found 2"),
     ("synth --layout vkitti2 --people True", "--people: expected False with --layout vkitti2, ... found True"),
+    (
+        "synth --people False --varied-people",
+        "--varied-people: expected a data set with people, found one without",
+    ),
     ("synth --variations night", "variations: expected all, or names among mixed, clone, ... found 'night'"),
     ("synth --edits nothing.yaml", "nothing.yaml: expected a readable file, found no such file or directory"),
     ("synth --meshes nowhere", "--meshes: expected a folder, found nowhere"),

@@ -117,6 +117,31 @@ def test_people_stand_on_the_ground_at_human_size(figure):
         assert np.ptp(points[:, 2]) < 0.95
 
 
+def test_varied_people_stand_on_the_ground_and_differ_in_outline():
+    """A coat or a bag changes the outline from the side; a motorcycle is wider and has thicker wheels."""
+    for figure in (people.pedestrian, people.cyclist):
+        outlines = set()
+        for seed in range(24):
+            soup = figure(np.random.default_rng(seed), True)
+            _check(soup)
+            points = soup.corners.reshape(-1, 3)
+            assert -0.08 < points[:, 1].max() < 0.08
+            assert 1.5 < -points[:, 1].min() < 1.95
+            assert np.ptp(points[:, 2]) < 1.1
+            assert np.ptp(points[:, 0]) < 2.1
+            outlines.add(len(soup))
+        assert len(outlines) > 5
+
+
+@pytest.mark.parametrize(
+    ("figure", "count", "spread"), [(people.pedestrian, 1060, 0.557607), (people.cyclist, 1968, 0.504367)]
+)
+def test_plain_people_are_as_in_streets_generated_earlier(figure, count, spread):
+    corners = figure(np.random.default_rng(3)).corners
+    assert len(corners) == count
+    assert float(corners.std()) == pytest.approx(spread, abs=1e-5)
+
+
 def test_join_keeps_every_triangle():
     parts = [stick((0, 0, 0), (0, -1, 0), (0.1, 0.1), Material.METAL, (0.3, 0.3, 0.3)), unit_box()]
     assert len(join(parts)) == sum(map(len, parts))

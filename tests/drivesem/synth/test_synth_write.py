@@ -288,6 +288,34 @@ def test_a_sliver_of_a_car_at_the_border_has_no_track(tmp_path):
     WRITERS["vkitti1"](tmp_path).write(order.places()[198], exposure)
 
 
+def test_varied_people_are_part_of_the_recipe(tmp_path):
+    assert "varied_people" not in Order(tmp_path, 1).recipe()
+    assert Order(tmp_path, 1, varied_people=True).recipe()["varied_people"] is True
+    plain, varied = (
+        [
+            actor
+            for job in list_jobs(Order(tmp_path, 12, varied_people=chosen))
+            for actor in plan_job(job).actors
+            if actor.label in ("Pedestrian", "Cyclist")
+        ]
+        for chosen in (False, True)
+    )
+    assert {actor.variant for actor in plain} == {0}
+    assert {actor.variant for actor in varied} == {1}
+    assert min(actor.size_lhw[1] for actor in varied) < 1.45 < min(actor.size_lhw[1] for actor in plain)
+    with pytest.raises(RangeError, match="varied_people"):
+        Order(tmp_path, 1, people=False, varied_people=True)
+
+
+def test_varied_people_leave_roads_and_vehicles_alone(tmp_path):
+    for plain, varied in zip(
+        list_jobs(Order(tmp_path, 4)), list_jobs(Order(tmp_path, 4, varied_people=True)), strict=True
+    ):
+        one, other = plan_job(plain), plan_job(varied)
+        assert one.setting.road == other.setting.road
+        assert [a for a in one.actors if a.lane_ds] == [a for a in other.actors if a.lane_ds]
+
+
 def test_a_share_of_nights_is_part_of_the_recipe(tmp_path):
     assert "night" not in Order(tmp_path, 1).recipe()
     assert Order(tmp_path, 1, night=0.5).recipe()["night"] == 0.5

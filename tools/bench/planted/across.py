@@ -57,6 +57,9 @@ FRAMES = {"common": 4, "rare": 3}
 """In so many frames at least."""
 BY_ITSELF = 0.6
 """Share of cars in Halton's draws that lie in any one band, at most; the others of a pair halve what it holds."""
+MIN_WIDTH = {"common": 0.0, "rare": 6.0}
+"""Width of a band, at least, in standard deviations of what the detector sees of one car in draws of the camera. In a
+narrower one no car is lost for certain; rare faults, which are planted for searches, would often be narrower."""
 SAMPLES = 16
 """States around each failure, which are pooled."""
 _TRIES = 4000
@@ -126,9 +129,12 @@ def plant_shared_fault(
     values, still, cars, frames = _reached(pools, rows)
     if not len(values):
         return None
+    narrowest = MIN_WIDTH[rarity] * _camera_noise(pools)[rows]
     rng = np.random.default_rng([seed, *"+".join(names).encode(), *([nth] if nth else [])])
     for _ in range(_TRIES):
         bands = np.array([_band(column, rng) for column in values.T])
+        if (bands[:, 1] - bands[:, 0] < narrowest).any():
+            continue
         each = (values >= bands[:, 0]) & (values <= bands[:, 1])
         inside = each.all(1)
         alone = each.mean(0)
@@ -166,6 +172,17 @@ def _reached(
             if car.margin > 0 and car.best is not None
         ]
     return np.array(drawn), np.array(still).reshape(-1, len(rows)), np.array(cars), np.array(frames)
+
+
+def _camera_noise(pools: Sequence[FramePool]) -> np.ndarray:
+    """Standard deviations of FEATURES of one car in draws of the camera, in the mean of cars; 0 without cars."""
+    by_car: dict[tuple[str, int], list[tuple[float, ...]]] = {}
+    for pool in pools:
+        for car in (car for sample in pool.camera_samples for car in sample):
+            if car.margin > 0 and car.best is not None:
+                by_car.setdefault((pool.frame, car.index), []).append(car.best)
+    variances = [np.var(rows, axis=0, ddof=1) for rows in by_car.values() if len(rows) > 1]
+    return np.sqrt(np.mean(variances, axis=0)) if variances else np.zeros(len(FEATURES))
 
 
 def _band(values: np.ndarray, rng: np.random.Generator) -> list[float]:

@@ -175,8 +175,8 @@ def _seen(
     return tuple(found)
 
 
-_MOST = 96
-"""Cached predictions, half a megabyte each: pictures that searches of one frame share."""
+_MOST = 400
+"""Cached predictions, half a megabyte each: pictures that the searches of one frame share."""
 
 
 class CachingDetector(DetectorWrapper):

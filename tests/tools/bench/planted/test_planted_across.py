@@ -12,6 +12,7 @@ from tools.bench.planted.across import (
     FRAMES,
     HITS,
     KINDS,
+    MIN_WIDTH,
     SharedFaultFrame,
     SharedFaultSearch,
     plant_shared_fault,
@@ -83,6 +84,28 @@ def test_faults_hide_few_cars_as_photographed_and_some_others(
     }
     assert len(hidden) >= CARS[rarity]
     assert len({frame for frame, _ in hidden}) >= FRAMES[rarity]
+
+
+def test_bands_of_rare_faults_are_wider_than_the_detector_s_noise(
+    pools: list[FramePool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heights = [
+        [car.best_candidates[0][1] for sample in pool.camera_samples for car in sample if car.index == index]
+        for pool in pools
+        for index in range(5)
+    ]
+    noise = float(np.sqrt(np.var(heights, axis=1, ddof=1).mean()))
+
+    def narrowest() -> float:
+        planted = [plant_shared_fault(pools, ("height_px", "lightness"), seed, 0, "rare") for seed in range(12)]
+        bands = [one.fault.bands[0] for one in planted if one is not None]
+        assert bands
+        return min(band.high - band.low for band in bands)
+
+    wide = 1.5 * narrowest() / noise
+    assert wide > MIN_WIDTH["rare"]
+    monkeypatch.setitem(MIN_WIDTH, "rare", wide)
+    assert narrowest() >= wide * noise
 
 
 def test_halton_s_states_name_faults(pools: list[FramePool]) -> None:
