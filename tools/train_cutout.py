@@ -95,7 +95,8 @@ class CutoutCases:
 def street_settings(index: int, split: str, pack: Assets, people: bool = False) -> SynthSettings:
     """Every other street with the pack's vehicles and skies, all with more vehicles, or people, than KITTI has."""
     fleet = of_split(pack.vehicles, split) if index % 2 else ()
-    layout = LayoutSettings(variants=VARIANTS[split], vehicles=(4, 12), fleet=fleet, crowd=CROWD if people else 1)
+    crowd = CROWD if people else 1
+    layout = LayoutSettings(VARIANTS[split], vehicles=(4, 12), fleet=fleet, crowd=crowd, varied_people=people)
     return SynthSettings(layout, bent=True, skies=pack.skies if index % 2 else ())
 
 
@@ -206,7 +207,7 @@ def make(
     for first in range(0, frames, CHUNK):
         part = folder / f"{first:05d}"
         facts = {"seed": seed, "split": split, "assets": assets is not None, "generator": GENERATOR_VERSION}
-        facts |= {"people": True} if people else {}
+        facts |= {"people": "varied"} if people else {}
         facts["frames"] = min(CHUNK, frames - first)
         made.append(part)
         if (part / "made.json").is_file() and files.read_json(part / "made.json") == facts:
@@ -658,7 +659,7 @@ CARD = """# {title} cut out of photographs, trained on generated streets
 - Data: {frames:,} streets of the project's own generator (version {version}, split train, seed {data_seed}),
   {vehicles:,} objects at least {least:.0f} px high of which 10% show; no photographs. {variety}
   Other light and colours, blur, noise, compression; objects as bright as what is around them; poles in front.
-- Training: {steps:,} steps of {batch}, in {count} cycles of the rate, {minutes:.0f} minutes of one CPU core,
+- Training: {steps:,} steps of {batch}, in {count} cycle(s) of the rate, {minutes:.0f} minutes of one CPU core,
   seed {seed}.{note}
 
 ## Figures
@@ -700,11 +701,12 @@ PEOPLE_CARD = {
     "title": "People and cyclists",
     "guide": "a thin upright box that fills the label's 2D box",
     "start": "Trained on from `cutout.safetensors`.",
-    "variety": """Boxes
-  with sides that are off as drawn by hand, more, and less. Clothes with folds and patterns.""",
+    "variety": """Varied people
+  (coats, skirts, hats, bags, children, people side by side, riders of motorcycles) in boxes with sides that are off as
+  drawn by hand, more, and less. Clothes with folds and patterns.""",
     "off": "4% of the box's sides",
-    "limits": """On photographs it is unsure of very bright clothes, bags, and people under 40 px high, and it leaves
-out what people carry and push; `scene_ir.derender.people` uses no outline that it is unsure of.""",
+    "limits": """On photographs it is unsure of very bright clothes and of people under 40 px high, and leaves out what
+people push; `scene_ir.derender.people` uses no outline that it is unsure of.""",
     "option": "--people --out scene_ir/derender/weights/people.safetensors",
 }
 COLUMNS = (
