@@ -195,7 +195,7 @@ def motorcycle(rng: np.random.Generator) -> Soup:
         stick(np.array([-0.02, -0.45, 0]), back, (0.07, 0.05), Material.CLOTH, dark, 6),
         stick(bar, front, (0.045, 0.045), Material.CLOTH, dark, 6),
         stick(
-            bar - np.array([0.05, 0, 0.33]), bar + np.array([-0.05, 0, 0.33]), (0.018,) * 2, Material.CLOTH, dark
+            bar - np.array([0.05, 0, 0.33]), bar + np.array([-0.05, 0, 0.33]), (0.018, 0.018), Material.CLOTH, dark
         ),
         stick(np.array([0.0, -0.3, 0.18]), np.array([-0.75, -0.38, 0.2]), (0.05, 0.06), Material.METAL, steel, 6),
     ]
