@@ -1,4 +1,4 @@
-"""Converts dataclasses to JSON, and back, and to CSV."""
+"""Converts dataclasses to JSON, and back."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import dataclasses
 import functools
 import json
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from drivesem.reporting.tables import cells_to_csv
 from scene_ir import files
 from scene_ir.errors import FormatError
 
@@ -94,13 +92,3 @@ def load_record(path: Path, kind: type[T], schema: int) -> T:
     if found != schema:
         raise FormatError(f"{path}: schema", str(schema), f"{found!r}, of another version of drivesem")
     return from_json(kind, data, str(path))
-
-
-def dump_rows(kind: type[Any], rows: Iterable[Any]) -> str:
-    """Return dataclasses of plain fields as CSV, a column per field."""
-    columns = list(_hints(kind))
-    return cells_to_csv(columns, ([_format_cell(getattr(row, name)) for name in columns] for row in rows))
-
-
-def _format_cell(value: Any) -> Any:
-    return str(value).lower() if isinstance(value, bool) else value

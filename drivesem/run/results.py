@@ -393,5 +393,5 @@ def load_frame(path: Path) -> FrameResult:
 
 def _format_share(share: ClusteredShare | PhotographedRate) -> str:
     """Such as 12.5 % [8.31, 17.9]; without exponents."""
-    value, low, high = (f"{round(100 * end, 6):.3g}" for end in (share.value, share.low, share.high))
+    value, low, high = (f"{round(100 * end, 3):.3g}" for end in (share.value, share.low, share.high))
     return f"{value} % [{low}, {high}]"

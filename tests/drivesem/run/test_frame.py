@@ -108,7 +108,7 @@ def test_a_rate_leaves_out_searched_states_and_objects_missed_before() -> None:
 
 
 def test_a_rate_is_printed_without_exponents() -> None:
-    share, weighted = ClusteredShare(10, 31, 2, 10 / 31, 2.4e-59, 1.0), PhotographedRate(0.125, 0.1, 0.2, 0.96)
+    share, weighted = ClusteredShare(10, 31, 2, 10 / 31, 2e-8, 1.0), PhotographedRate(0.125, 0.1, 0.2, 0.96)
     summary: Any = SimpleNamespace(rate=share, rate_as_photographed=None, noun="object")
     text = RunSummary.describe_rate(summary)
     assert text == "rate: 10 of 31 objects in random states of 2 frames missed (32.3 % [0, 100])"
