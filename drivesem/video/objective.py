@@ -151,13 +151,13 @@ class ClipSpace(ThetaSpace[Parameter]):
     def physical(self, i: int, value: float) -> tuple[float, str] | None:
         """Value in metres, degrees or percent, measured in the first frame with the object."""
         parameter, owner, k = self._locate(i)
-        spec = SPECS[parameter]
-        if not spec.per_object:
+        if not SPECS[parameter].per_object:
             return None
         frame = next(f for f, rows in enumerate(self.rows) if bool((rows == owner).any()))
         place = int((self.rows[frame] == owner).nonzero()[0])
         space = self.spaces[frame]
-        return space.physical(space.blocks[parameter].start + place * spec.size + k % spec.size, value)
+        size = space.specs[parameter].size
+        return space.physical(space.blocks[parameter].start + place * size + k % size, value)
 
     def _tighten(self, parameter: Parameter, space: ParameterSpace, rows: Tensor) -> None:
         for own, theirs, tighter in (

@@ -140,7 +140,14 @@ def test_names_units_and_values_are_a_cars(space: ClipSpace) -> None:
     assert first in message
     assert str(message[first]["display"]).endswith(" m")
     assert message["tracks[9].yaw"]["unit"] == "rad"
+    assert str(message["tracks[9].yaw"]["display"]).endswith(" deg")
     assert "weather.fog" in message
+    assert not any(" " in str(entry["display"]) for name, entry in message.items() if "paint" in name)
+
+
+def test_colours_alone_have_values(streets: DerenderedClip) -> None:
+    space = ClipSpace([ParameterSpace(scene, ("color",)) for scene in streets.scenes], streets.tracks)
+    assert len(space.theta_by_name(random_theta(space))) == space.dim
 
 
 def test_projection_is_feasible_in_every_frame_and_keeps_what_is(
