@@ -25,6 +25,7 @@ from scene_ir.render.environment import (
     shadow_softening,
     sunlight_share,
 )
+from scene_ir.render.fixed_geometry import FixedGeometry
 from scene_ir.render.lamps import draw_lamps
 from scene_ir.render.night import apply_night, night_share
 from scene_ir.render.prepare import ObjectLayers, PreparedScene, RenderSettings, SceneBatch, concat, is_active
@@ -45,9 +46,9 @@ class Compositor(PreparedScene):
 
     @cached_property
     @torch.no_grad()
-    def fixed_geometry(self) -> fast.FixedGeometry | None:
+    def fixed_geometry(self) -> FixedGeometry | None:
         """Input of the fast kernels, gathered on first use; None where they do not apply."""
-        return fast.FixedGeometry.from_scene(self) if self.texels is not None and self.backend == "warp" else None
+        return FixedGeometry.from_scene(self) if self.texels is not None and self.backend == "warp" else None
 
     @cached_property
     def _compositor_before(self) -> Compositor:
@@ -186,7 +187,7 @@ class Compositor(PreparedScene):
 def _draw_layers(
     members: Sequence[Compositor],
     pack: SceneBatch,
-    fixed: fast.FixedGeometry,
+    fixed: FixedGeometry,
     objects: Sequence[Objects],
     suns: Sequence[PerturbedSun | None],
 ) -> list[ObjectLayers]:
@@ -217,9 +218,9 @@ def _draw_layers(
 
 
 @lru_cache(maxsize=2)
-def _batch_compositors(members: tuple[Compositor, ...]) -> tuple[SceneBatch, fast.FixedGeometry]:
+def _batch_compositors(members: tuple[Compositor, ...]) -> tuple[SceneBatch, FixedGeometry]:
     """Compositors with fast kernels, as one batch."""
-    return SceneBatch(members), fast.FixedGeometry.concat(
+    return SceneBatch(members), FixedGeometry.concat(
         [m.fixed_geometry for m in members if m.fixed_geometry is not None]
     )
 

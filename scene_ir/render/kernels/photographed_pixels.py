@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,11 +26,9 @@ from scene_ir.raster.launch import (
     split_range,
 )
 from scene_ir.render import channels, surfaces
+from scene_ir.render.fixed_geometry import FixedGeometry
 from scene_ir.render.kernels import shading, shadows
 from scene_ir.render.prepare import VisibleSurfaces
-
-if TYPE_CHECKING:
-    from scene_ir.render.fast import FixedGeometry
 
 Painter = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """From mesh, halo, lookup, unseen, codes, table and nearest to repainted mesh and halo."""

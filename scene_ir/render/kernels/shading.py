@@ -134,7 +134,7 @@ class PackedPixels:
 @wp.struct
 class Vertices:
     """Faces of the meshes and their neighbours, and the vertices: fields of `prepare.PlacedGeometry` and
-    `fast.FixedGeometry`.
+    `fixed_geometry.FixedGeometry`.
     """
 
     faces: Vec3is
