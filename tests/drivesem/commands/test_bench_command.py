@@ -116,7 +116,7 @@ def test_out_must_be_a_folder_or_a_new_file(tmp_path: Path) -> None:
 def test_night() -> None:
     """Two embedded frames tell of a thousand."""
     words = ["bench", "night", "--limit", "2", "--count", "1000", "--workers", "1", "--json"]
-    printed = invoke(*words, "--attack", "--steps 2 --no-confirm")
+    printed = invoke(*words, "--attack=--steps 2 --no-confirm")
     result = json.loads(printed.out)
     assert result["attack"] == "drivesem attack --steps 2 --no-confirm"
     assert "timing: drivesem attack --steps 2 --no-confirm" in printed.err
