@@ -247,6 +247,8 @@ def test_questions_on_a_run(tmp_path: Path) -> None:
         "street",
         "--limit",
         "1",
+        "--seed",
+        "3",
     ]
     with pretended():
         run(words, found, "cuda")
