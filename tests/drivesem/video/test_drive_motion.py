@@ -109,7 +109,9 @@ def test_people_of_a_generated_clip_walk_as_their_places_do(tmp_path: Path) -> N
         offset = (meant[frame].objects.translation - scene.objects.translation)[rows]
         assert float((offset @ scene.environment.ground[:3]).abs().max()) < 1e-5
         assert float(offset.norm(dim=1).min()) > 0.01
-    assert max(Watched(clip).trembling_px(meant, meant, *walking)) < 3 * STEADY_PX  # limbs move, and outlines differ
+    assert (
+        max(Watched(clip).trembling_px(meant, meant, *walking)) < 3 * STEADY_PX
+    )  # limbs move, and outlines differ
 
 
 @pytest.mark.slow
