@@ -64,14 +64,15 @@ def _body(hip: np.ndarray, lean: float, colours: tuple[np.ndarray, ...]) -> tupl
     return parts, hip + up * 0.5
 
 
-_HEAD = 0.71
-"""Height of the head's middle over the hip, m."""
+def _head(hip: np.ndarray, lean: float) -> np.ndarray:
+    """The middle of the head of `_body`."""
+    return hip + np.array([np.sin(lean), -np.cos(lean), 0.0]) * 0.71 + np.array([0.02, 0, 0])
 
 
 def _headwear(rng: np.random.Generator, hip: np.ndarray, lean: float, hair: np.ndarray) -> list[Soup]:
     """Long hair, a cap, a hat, a hood, or none of them, on the head of `_body`."""
     up = np.array([np.sin(lean), -np.cos(lean), 0.0])
-    head, cloth = hip + up * _HEAD + np.array([0.02, 0, 0]), _pick(_CLOTH, rng)
+    head, cloth = _head(hip, lean), _pick(_CLOTH, rng)
     match int(rng.integers(5)):
         case 0:
             return [ball(head - up * 0.06 - np.array([0.06, 0, 0]), (0.07, 0.17, 0.1), Material.CLOTH, hair, 1)]
@@ -214,8 +215,7 @@ def cyclist(rng: np.random.Generator, varied: bool = False) -> Soup:
     lean = float(rng.uniform(0.0, 0.4) if motor else rng.uniform(0.3, 0.65))
     parts, shoulder = _body(hip, lean, (shirt, skin, hair))
     if motor:
-        head = hip + _HEAD * np.array([np.sin(lean), -np.cos(lean), 0]) + np.array([0.02, 0, 0])
-        parts.append(ball(head, (0.14, 0.15, 0.125), Material.CLOTH, _pick(_CLOTH, rng), 1))
+        parts.append(ball(_head(hip, lean), (0.14, 0.15, 0.125), Material.CLOTH, _pick(_CLOTH, rng), 1))
     elif varied:
         parts += _headwear(rng, hip, lean, hair)
     if varied and rng.random() < 0.3:

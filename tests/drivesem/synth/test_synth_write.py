@@ -16,6 +16,7 @@ from drivesem.synth import write
 from drivesem.synth.exposure import CLASS_NAMES, expose
 from drivesem.synth.frames import VARIANTS, SynthSettings, apply_variation, boxes_alone, plan_frame, render_frame
 from drivesem.synth.layout import LayoutSettings
+from drivesem.synth.world import actor_soup
 from drivesem.synth.write import Order, list_jobs, plan_job, synthesise
 from scene_ir import files
 from scene_ir.errors import FormatError, RangeError
@@ -302,6 +303,7 @@ def test_varied_people_are_part_of_the_recipe(tmp_path):
     )
     assert {actor.variant for actor in plain} == {0}
     assert {actor.variant for actor in varied} == {1}
+    assert any(len(actor_soup(one, 0)) != len(actor_soup(replace(one, variant=0), 0)) for one in varied)
     assert min(actor.size_lhw[1] for actor in varied) < 1.45 < min(actor.size_lhw[1] for actor in plain)
     with pytest.raises(RangeError, match="varied_people"):
         Order(tmp_path, 1, people=False, varied_people=True)

@@ -342,7 +342,7 @@ def test_people_and_what_comes_into_view_are_regions_of_both() -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("data") / "streets"
-    list(synthesise(Order(out, 1, seed=5, split="heldout", variations=("clone", "fog"))))
+    list(synthesise(Order(out, 1, seed=5, split="heldout", variations=("clone", "fog"), varied_people=True)))
     return out
 
 
