@@ -21,7 +21,7 @@ from scene_ir import files
 from scene_ir.exchange import CHANGE_KEY
 from scene_ir.io import load_scene, save_scene
 
-_CHANGED = "not the photograph: vehicles that were removed, exchanged, added or loaded remain so"
+_CHANGED = "not the photograph: objects that were removed, exchanged, added or loaded remain so"
 
 
 def edit_command(config: EditConfig) -> int:
@@ -49,9 +49,9 @@ def edit_command(config: EditConfig) -> int:
         facts = {"objects": len(result.scene.objects), "notes": notes, "seconds": seconds}
         print_json({"scene": config.scene, **written, **facts})
     else:
-        vehicles = format_count(len(result.scene.objects), "vehicle")
-        vehicles += f", {len(result.removed)} removed" if result.removed else ""
-        Console().print(f"{' and '.join(written.values())}: {vehicles} ({seconds:.1f} s)", soft_wrap=True)
+        objects = format_count(len(result.scene.objects), "object")
+        objects += f", {len(result.removed)} removed" if result.removed else ""
+        Console().print(f"{' and '.join(written.values())}: {objects} ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 
@@ -88,7 +88,7 @@ def render_command(config: RenderConfig) -> int:
     if config.json:
         print_json({"scene": config.scene, "out": str(out), "objects": len(scene.objects), "seconds": seconds})
     else:
-        Console().print(f"{out}: {format_count(len(scene.objects), 'vehicle')} ({seconds:.1f} s)", soft_wrap=True)
+        Console().print(f"{out}: {format_count(len(scene.objects), 'object')} ({seconds:.1f} s)", soft_wrap=True)
     return 0
 
 
@@ -120,10 +120,9 @@ def derender_command(config: DerenderConfig) -> int:
         print_json({"out": str(result.out), "frames": frames, **facts})
         return 0
     lines = Console()
-    noun = "object" if config.people else "vehicle"
     for name, summary in result.frames.items():
         duration = "already there" if summary.seconds is None else f"{summary.seconds:.1f} s"
-        lines.print(f"{name}: {format_count(summary.objects, noun)}, {duration}", soft_wrap=True, highlight=False)
+        lines.print(f"{name}: {format_count(summary.objects, 'object')}, {duration}", soft_wrap=True, highlight=False)
     reasons = Counter(reason for summary in result.frames.values() for reason in summary.left_out.values())
     if reasons:
         text = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())

@@ -99,7 +99,7 @@ class Scene:
     def __repr__(self) -> str:
         _, height, width = self.ir.photograph.shape
         changes = f", {len(self.theta)} changes" if self.theta else ""
-        return f"Scene({self.name!r}, {width}x{height} px, {len(self)} vehicles{changes})"
+        return f"Scene({self.name!r}, {width}x{height} px, {len(self)} objects{changes})"
 
     def render(self) -> NDArray[np.uint8]:
         """Render the scene, (H, W, 3) RGB."""

@@ -64,12 +64,12 @@ def scene_sheet(scene: SceneIR, title: str) -> np.ndarray:
     kinds = ", ".join(name.removesuffix("_map") for name in MAPS)
     panels = (
         (
-            f"photograph, {format_count(count, 'vehicle')}: outlines of their meshes",
+            f"photograph, {format_count(count, 'object')}: outlines of their meshes",
             _draw_outlines(meshes, photograph),
         ),
         ("mattes", _draw_rows(original, _draw_mattes(original, photograph))),
         ("normals of the meshes", _draw_normals(meshes, photograph)),
-        ("depth behind the vehicles (log, near is bright)", colourise_depth(original.depth.cpu().numpy())),
+        ("depth behind the objects (log, near is bright)", colourise_depth(original.depth.cpu().numpy())),
         (f"maps: {kinds}", _draw_maps(original)),
         ("shadows: what is left of the light", _draw_shadows(original)),
         ("background", to_uint8(original.background)),

@@ -501,7 +501,7 @@ function drawMap() {
   svg.replaceChildren(...parts);
   const cells = [...map.cells.values()], lost = cells.filter(c => c.status === "lost" || c.status === "missed").length;
   const none = !movable().includes(selection.car);
-  $("map-status").textContent = none ? "no vehicle selected" : `${lost} of ${cells.length} not found${cells.length < overview.grid * overview.grid ? ", in progress" : ""}`;
+  $("map-status").textContent = none ? "no object selected" : `${lost} of ${cells.length} not found${cells.length < overview.grid * overview.grid ? ", in progress" : ""}`;
   $("map").dataset.cells = cells.length;
 }
 let aiming = false;

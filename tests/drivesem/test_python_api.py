@@ -158,11 +158,11 @@ def test_a_scene_has_a_picture_and_a_description(scene: ds.Scene, tmp_path: Path
 
 
 def test_a_scene_says_what_is_changed(scene: ds.Scene) -> None:
-    assert repr(scene) == "Scene('demo-000', 1241x376 px, 6 vehicles)"
+    assert repr(scene) == "Scene('demo-000', 1241x376 px, 6 objects)"
     assert scene.theta == {}
     assert np.allclose(scene.boxes(), scene.ir.objects.box2d.numpy(), atol=0.51)
     changed = scene.edit("objects[1].translate=0m,0.5m", "objects[0].rotate=10deg", weather="fog")
-    assert repr(changed).endswith("6 vehicles, 4 changes)")
+    assert repr(changed).endswith("6 objects, 4 changes)")
     assert changed.theta == pytest.approx(
         {
             "weather.fog": 0.6,

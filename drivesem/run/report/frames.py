@@ -426,7 +426,7 @@ def _with_pictures(card: FrameCard) -> FrameCard:
     encoded, quality = _small(_reduced(photograph, LARGEST_PX))
     before = PictureLayer(
         title="before",
-        alt=f"Frame {card.identifier} before the change: {_describe_vehicles(first)}",
+        alt=f"Frame {card.identifier} before the change: {_describe_objects(first)}",
         source=_address(encoded),
         sets=_shared([_before(one, (width, height)) for one in card.outcomes]),
     )
@@ -472,7 +472,7 @@ def describe_outcome(one: FrameOutcome) -> str:
     return sure + ", ".join(parts)
 
 
-def _describe_vehicles(one: FrameOutcome) -> str:
+def _describe_objects(one: FrameOutcome) -> str:
     result = one.result
     counts = f"{len(result.judged)} judged, {len(result.found_before)} found before"
     return f"{format_count(result.objects, 'object')}, {counts}"

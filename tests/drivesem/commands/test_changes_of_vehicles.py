@@ -54,7 +54,7 @@ def test_an_edit_keeps_the_change_and_reports_it(
     scene = runs["leave"][0] / "frames" / "demo-000" / "scene"
     capsys.readouterr()
     assert main(["edit", str(scene), "--photographed", "--out", str(tmp_path / "a.png")]) == 0
-    note = "not the photograph: vehicles that were removed, exchanged, added or loaded remain so"
+    note = "not the photograph: objects that were removed, exchanged, added or loaded remain so"
     assert f"drivesem: {note}" in capsys.readouterr().err.splitlines()
 
 

@@ -115,7 +115,7 @@ def test_frames_are_summarised(taken: Path, tmp_path: Path) -> None:
     assert 0 < frame["seconds"] <= found["seconds"]
     assert found["failed"] == {}
     assert Path(found["out"]) == out
-    assert f"demo-000: {frame['objects']} vehicles, already there" in invoke(*words).out
+    assert f"demo-000: {frame['objects']} objects, already there" in invoke(*words).out
 
 
 def test_it_goes_on_where_it_stopped(taken: Path, tmp_path: Path) -> None:
@@ -318,14 +318,14 @@ def test_removed_vehicles_stay_removed_and_are_reported(
     words = ["edit", str(demo), "--remove", "0", "--set", "objects[1].rotate=10deg", "--save", str(changed)]
     assert main(words) == 0
     left = len(load_scene(demo).objects) - 1
-    assert f"S: {left} vehicles, 1 removed (" in capsys.readouterr().out
+    assert f"S: {left} objects, 1 removed (" in capsys.readouterr().out
     words = ["edit", str(changed), "--photographed", "-o", str(still)]
     printed = invoke(*words, "--json")
     found, output = json.loads(printed.out), printed.err
-    note = "not the photograph: vehicles that were removed, exchanged, added or loaded remain so"
+    note = "not the photograph: objects that were removed, exchanged, added or loaded remain so"
     assert output == f"drivesem: {note}\n"
     assert (found["notes"], found["objects"]) == ([note], left)
-    assert f"still.png: {left} vehicles (" in invoke(*words).out
+    assert f"still.png: {left} objects (" in invoke(*words).out
     assert not np.array_equal(files.read_image(still), files.read_image(demo / "photograph.png"))
     once = tmp_path / "once.png"
     run_json("edit", demo, "--remove", "0", "-o", once)
