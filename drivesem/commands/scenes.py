@@ -122,7 +122,9 @@ def derender_command(config: DerenderConfig) -> int:
     lines = Console()
     for name, summary in result.frames.items():
         duration = "already there" if summary.seconds is None else f"{summary.seconds:.1f} s"
-        lines.print(f"{name}: {format_count(summary.objects, 'object')}, {duration}", soft_wrap=True, highlight=False)
+        lines.print(
+            f"{name}: {format_count(summary.objects, 'object')}, {duration}", soft_wrap=True, highlight=False
+        )
     reasons = Counter(reason for summary in result.frames.values() for reason in summary.left_out.values())
     if reasons:
         text = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())

@@ -19,9 +19,10 @@ from drivesem.attacks.methods.base import GRADIENT_PASSES
 from drivesem.attacks.objective import Objective
 from drivesem.failures import margins as margin
 from drivesem.failures.certificate import pad_visible_boxes
+from drivesem.failures.feature_cells import Cell
 from drivesem.failures.kinds import LabelledDetections, match_detections
 from drivesem.failures.nuisances import Nuisances, NuisanceSample
-from drivesem.failures.search_log import ObjectPatches
+from drivesem.failures.search_log import ObjectPatches, cells_of_features
 from scene_ir.render.compositor import render_batch
 from scene_ir.types import Render, SceneIR
 
@@ -126,17 +127,18 @@ class NuisanceMarginOracle:
         return self._compute_margins(theta, number, SHARPNESS)
 
     @torch.no_grad()
-    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
+    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor, list[Cell]]:
         """Render theta (D,) in one sample, without a detector pass.
 
         Returns:
-            Rows (K,) of the objects that count, and their features (K, F), `search_log.OBJECT_FEATURES`.
+            Rows (K,) of the objects that count, their features (K, F), `search_log.OBJECT_FEATURES`, and their cells.
         """
         scene, sample = self._perturb_scene(theta, number), self.sample(number)
         render = self.objective.compositor.render(scene)
         targets, rows = self._counted_targets(scene, render)
         boxes_xyxy = sample.transform_boxes(targets.boxes_xyxy[rows])
-        return rows, ObjectPatches.from_image(sample.degrade_image(render.image), boxes_xyxy).features()
+        features = ObjectPatches.from_image(sample.degrade_image(render.image), boxes_xyxy).features()
+        return rows, features, cells_of_features(features)
 
     def clear_cache(self) -> None:
         """Drop cached samples and layers; they are recomputed when needed."""

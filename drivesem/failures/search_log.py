@@ -58,9 +58,14 @@ class ObjectPatches:
 
     def cells(self) -> list[Cell]:
         """The cells of the K objects."""
-        columns = dict(zip(OBJECT_FEATURES, self.features().T.numpy(), strict=True))
-        levels = [np.searchsorted(edges, columns[name], side="right") for name, edges in CELL_EDGES.items()]
-        return [(size, low, place, light) for size, low, place, light in np.stack(levels, 1).tolist()]
+        return cells_of_features(self.features())
+
+
+def cells_of_features(features: Tensor) -> list[Cell]:
+    """The cells of K objects with features (K, F) in the order of `OBJECT_FEATURES`."""
+    columns = dict(zip(OBJECT_FEATURES, features.T.numpy(), strict=True))
+    levels = [np.searchsorted(edges, columns[name], side="right") for name, edges in CELL_EDGES.items()]
+    return [(size, low, place, light) for size, low, place, light in np.stack(levels, 1).tolist()]
 
 
 def _join(patches: Sequence[ObjectPatches]) -> ObjectPatches:

@@ -347,7 +347,7 @@ class AttackWorker:
         worker = self
         if isinstance(self.method, Learn):
             self.memory.read(out / FRAMES)
-            worker = replace(self, method=replace(self.method, model=self.memory.model()))
+            worker = replace(self, method=replace(self.method, knowledge=self.memory.knowledge()))
         try:
             attacked = worker.attack_scene(identifier, self.source.scene(identifier))
         except NoVehicleError:
@@ -409,7 +409,7 @@ class AttackWorker:
             grade_notes=notes,
             passes=passes,
             visits=objective.cell_visits(evaluation),
-            margin_rows=objective.search_log.margin_rows() if isinstance(method, Learn) else None,
+            learns=isinstance(method, Learn),
             seconds=end - start,
             grading_seconds=end - search_end,
         )

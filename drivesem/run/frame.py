@@ -46,7 +46,7 @@ from drivesem.run.results import (
     VehicleCounts,
     dump_frame,
 )
-from drivesem.run.search_memory import MARGINS
+from drivesem.run.search_memory import MARGINS, Experience
 from scene_ir import files
 from scene_ir.errors import FormatError
 from scene_ir.io import load_scene, save_scene, to_uint8
@@ -77,12 +77,18 @@ class AttackedScene:
     """Detector passes, a gradient counted as 3."""
     visits: tuple[CellVisit, ...]
     """Where in feature space the objects were evaluated."""
-    margin_rows: np.ndarray | None
-    """(R, F + 1), features and margins for the searches of other frames; None where none reads them."""
+    learns: bool
+    """Whether searches of other frames read `experience`."""
     seconds: float
     """Total time."""
     grading_seconds: float
     """Time after the search."""
+
+    @property
+    def experience(self) -> Experience:
+        """What the search tells other frames."""
+        certain = [failure.index for failure in certain_losses(self)]
+        return Experience.from_search(self.objective, self.search.theta, self.visits, certain)
 
 
 def write_frame(attacked: AttackedScene, folder: Path) -> FrameResult:
@@ -172,8 +178,8 @@ def _write(part: Path, attacked: AttackedScene, result: FrameResult) -> None:
             for c in result.theta
         },
     )
-    if attacked.margin_rows is not None:
-        files.write_npz(part / MARGINS, {"rows": attacked.margin_rows})
+    if attacked.learns:
+        attacked.experience.write(part / MARGINS)
     files.write_text(part / RESULT, dump_frame(result))
 
 

@@ -3,65 +3,127 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from drivesem.attacks.methods.learned import MIN_ROWS, MarginModel
+from drivesem.attacks.methods.learned import MIN_ROWS, Knowledge, MarginModel
+from drivesem.attacks.objective import Objective
+from drivesem.failures.feature_cells import CELL_EDGES, CellVisit
 from drivesem.failures.search_log import OBJECT_FEATURES
 from scene_ir import files
 from scene_ir.errors import FormatError
 
 MARGINS = "margins.npz"
-"""File of a frame's rows: features and margins of its search."""
+"""File of what a frame's search tells other frames."""
 _FRAMES = 4
 """The model is fitted anew after so many frames."""
+_COLUMNS = len(OBJECT_FEATURES) + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Experience:
+    """What the search of one frame tells other frames."""
+
+    rows: np.ndarray
+    """(R, F + 1) float32, features and margins, see `SearchLog.margin_rows`."""
+    scene: np.ndarray
+    """(S,) float32, the scene's coordinates of theta in the counterexample."""
+    cells: np.ndarray
+    """(L, 4) int64, cells of the objects that are lost for certain in it."""
+
+    @classmethod
+    def from_search(
+        cls, objective: Objective, theta: Tensor, visits: Sequence[CellVisit], certain: Collection[int | None]
+    ) -> Experience:
+        """Of a finished search.
+
+        Args:
+            objective: Of the search.
+            theta: (D,), of the counterexample.
+            visits: Cells of the objects, see `SearchLog.visits`.
+            certain: Objects that are lost for certain.
+        """
+        space = objective.space
+        shared = [theta[where] for parameter, where in space.blocks.items() if not space.owner_count(parameter)]
+        scene = torch.cat(shared).float().cpu().numpy() if shared else np.empty(0, np.float32)
+        cells = [visit.cell for visit in visits if visit.final and visit.index in certain]
+        return cls(objective.search_log.margin_rows(), scene, np.array(cells, int).reshape(-1, len(CELL_EDGES)))
+
+    @classmethod
+    def empty(cls) -> Experience:
+        """Of a frame of which nothing is known."""
+        return cls(
+            np.empty((0, _COLUMNS), np.float32), np.empty(0, np.float32), np.empty((0, len(CELL_EDGES)), int)
+        )
+
+    @classmethod
+    def read(cls, path: Path) -> Experience:
+        """Read a frame's file. Raises FormatError for a damaged one."""
+        arrays = files.read_npz(path)
+        try:
+            rows, scene, cells = (arrays[name] for name in ("rows", "scene", "cells"))
+        except KeyError as error:
+            raise FormatError(str(path), "rows, scene and cells", sorted(arrays)) from error
+        shapes = f"rows {rows.shape}, scene {scene.shape}, cells {cells.shape}"
+        if rows.ndim != 2 or rows.shape[1] != _COLUMNS or scene.ndim != 1 or cells.shape[1:] != (len(CELL_EDGES),):
+            raise FormatError(str(path), f"rows (R, {_COLUMNS}), scene (S,), cells (L, {len(CELL_EDGES)})", shapes)
+        if not (np.isfinite(rows).all() and np.isfinite(scene).all()):
+            raise FormatError(str(path), "finite numbers", "others")
+        return cls(rows.astype(np.float32), scene.astype(np.float32), cells.astype(int))
+
+    def write(self, path: Path) -> None:
+        """Write the frame's file."""
+        files.write_npz(path, {"rows": self.rows, "scene": self.scene, "cells": self.cells})
 
 
 @dataclass
 class SearchMemory:
-    """Rows of finished frames, and the model of them."""
+    """What finished frames tell, and the model of their margins."""
 
-    _rows: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
-    """(R, F + 1) by frame."""
+    _frames: dict[str, Experience] = field(default_factory=dict[str, Experience])
+    """By frame."""
     _frames_in_model: tuple[str, ...] = ()
     """Frames of the last fit."""
     _model: MarginModel | None = None
     """The last fit."""
 
-    def add(self, frame: str, rows: np.ndarray) -> None:
-        """Add the rows (R, F + 1) of a frame, see `SearchLog.margin_rows`."""
-        self._rows[frame] = rows
+    def add(self, frame: str, experience: Experience) -> None:
+        """Add a frame."""
+        self._frames[frame] = experience
 
     def read(self, folder: Path) -> None:
         """Add the frames in a run's folder of frames. A damaged file is named on standard error, and left out."""
         for path in sorted(folder.glob(f"*/{MARGINS}")):
-            if path.parent.name in self._rows:
+            if path.parent.name in self._frames:
                 continue
             try:
-                rows = read_margin_rows(path)
+                experience = Experience.read(path)
             except FormatError as error:
                 sys.stderr.write(f"{error}; the search goes on without this frame\n")
-                rows = np.empty((0, len(OBJECT_FEATURES) + 1), np.float32)
-            self.add(path.parent.name, rows)
+                experience = Experience.empty()
+            self.add(path.parent.name, experience)
 
-    def model(self) -> MarginModel | None:
-        """A model of the frames, None for too few rows. The same frames give the same model."""
-        frames = tuple(sorted(self._rows))
-        frames = frames[: len(frames) // _FRAMES * _FRAMES]
-        if frames != self._frames_in_model:
-            rows = np.concatenate([self._rows[frame] for frame in frames])
+    def knowledge(self) -> Knowledge:
+        """What the frames tell. The same frames tell the same."""
+        names = sorted(self._frames)
+        losing = [self._frames[name] for name in names if len(self._frames[name].cells)]
+        scenes = np.stack([one.scene for one in losing]) if losing else np.empty((0, 0), np.float32)
+        return Knowledge(
+            model=self._fit_model(tuple(names[: len(names) // _FRAMES * _FRAMES])),
+            scenes=torch.from_numpy(scenes),
+            lost=torch.tensor([float(len(one.cells)) for one in losing]),
+            failing=frozenset(tuple(cell) for one in losing for cell in one.cells.tolist()),
+        )
+
+    def _fit_model(self, names: tuple[str, ...]) -> MarginModel | None:
+        """A model of these frames; None for too few rows."""
+        if names != self._frames_in_model:
+            rows = np.concatenate([self._frames[name].rows for name in names])
             self._model = MarginModel(rows) if len(rows) >= MIN_ROWS else None
-            self._frames_in_model = frames
+            self._frames_in_model = names
         return self._model
-
-
-def read_margin_rows(path: Path) -> np.ndarray:
-    """Read a frame's rows (R, F + 1). Raises FormatError for a damaged file."""
-    rows = files.read_npz(path).get("rows")
-    columns = len(OBJECT_FEATURES) + 1
-    if rows is None or rows.ndim != 2 or rows.shape[1] != columns or not np.isfinite(rows).all():
-        expected = f"rows of {columns} finite numbers"
-        raise FormatError(str(path), expected, "none" if rows is None else f"others, of shape {rows.shape}")
-    return rows.astype(np.float32)

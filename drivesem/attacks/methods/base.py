@@ -111,8 +111,10 @@ class MarginOracle(Protocol):
         """
         ...
 
-    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
-        """Rows (K,) and features (K, F) of the objects that count at theta (D,) in a sample. Costs no pass."""
+    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor, Sequence[tuple[int, ...]]]:
+        """Rows (K,), features (K, F) and cells of the map of the objects that count at theta (D,) in a sample. Costs
+        no pass.
+        """
         ...
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:

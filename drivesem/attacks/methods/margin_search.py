@@ -31,6 +31,8 @@ _FIXED_PASSES = 4
 """Passes of the benign pictures and the final score."""
 _SEARCH_SAMPLES = 8
 """Number of nuisance samples that the search uses in turn."""
+_FINAL_NUMBERS = range(_SEARCH_SAMPLES, _SEARCH_SAMPLES + _FINAL_SAMPLES)
+"""Numbers of the nuisance samples of comparisons."""
 FIRST_HELD_OUT_SAMPLE = _SEARCH_SAMPLES + _FINAL_SAMPLES
 """Number of the first nuisance sample that no search uses."""
 
@@ -89,6 +91,14 @@ class UnitBox:
         """theta (D,) at u (K,), within the bounds; feasible or not."""
         theta = self._offset + point @ self._matrix
         return torch.minimum(torch.maximum(theta, self._problem.lower), self._problem.upper)
+
+    def with_scene(self, point: Tensor, scene: Tensor) -> Tensor:
+        """The point u (K,) with the scene's coordinates of theta (S,), as far as the bounds allow."""
+        rows, columns = self.owner < 0, self.theta_owner < 0
+        block = self._matrix[rows][:, columns]
+        # each coordinate of the scene spans one of theta
+        own = block @ (scene.to(block) - self._offset[columns]) / block.square().sum(1).clamp_min(1e-12)
+        return point.masked_scatter(rows, own.clamp(0, 1))
 
     def slope(self, gradient: Tensor) -> Tensor:
         """The gradient (K,) with respect to u, from the gradient (D,) with respect to theta."""
@@ -160,9 +170,14 @@ class MarginSearchState:
         order = sorted(range(len(points)), key=values.__getitem__)
         return [points[order[0]], *(self.combine_objects(points, margins, row) for row in order[:2])]
 
+    def loses_all(self, point: Tensor) -> bool:
+        """Whether all objects that count are lost at u (K,) in each nuisance sample that the search has not used."""
+        margins = self.margins([point] * _FINAL_SAMPLES, _FINAL_NUMBERS)
+        return bool((margins[:, self.oracle.counted_objects.to(margins.device)] < 0).all())
+
     def select_best(self, points: list[Tensor]) -> Tensor:
         """The point with the lowest mean objective in nuisance samples that the search has not used."""
-        numbers = range(_SEARCH_SAMPLES, _SEARCH_SAMPLES + min(_FINAL_SAMPLES, self.passes_left // len(points)))
+        numbers = _FINAL_NUMBERS[: self.passes_left // len(points)]
         states = [(self.theta(point)[0], number) for point in points for number in numbers]
         margins = self.oracle.margins([theta for theta, _ in states], [number for _, number in states])
         values = [sum(map(self.objective, rows)) for rows in margins.split(len(numbers))]
@@ -253,7 +268,7 @@ def balanced_corners(owner: Tensor, count: int, generator: torch.Generator) -> T
     return ends[rows[:count]].to(owner.device)
 
 
-_START_SHARE = 0.4
+START_SHARE = 0.4
 """Share of the passes that choose the start."""
 _DIFFERENCE_REACH = 0.2
 """Half the width of differences, as a share of the bounds."""
@@ -273,13 +288,13 @@ class Climb(MarginSearch):
     """Whether to use gradients where the detector has one."""
 
     def _search(self, search: MarginSearchState) -> Tensor:
-        points = self._start_points(search, max(int(_START_SHARE * self.passes), 1))
-        start = _choose_start(search, *points)
-        return _Descent(search, self.gradient and search.oracle.differentiable).descend(start)
+        count = max(int(START_SHARE * self.passes), 1)
+        return self._climb(search, sample_points(search, count), range(1, count, 2))
 
-    def _start_points(self, search: MarginSearchState, count: int) -> tuple[Tensor, range]:
-        """Points (count, K) of which the start is made, and the places of those that are uniform in the box."""
-        return sample_points(search, count), range(1, count, 2)
+    def _climb(self, search: MarginSearchState, points: Tensor, random: Collection[int]) -> Tensor:
+        """Descend from a start that points (C, K) give; random: the places of those that are uniform in the box."""
+        start = _choose_start(search, points, random)
+        return _Descent(search, self.gradient and search.oracle.differentiable).descend(start)
 
 
 def _choose_start(search: MarginSearchState, points: Tensor, random: Collection[int]) -> Tensor:

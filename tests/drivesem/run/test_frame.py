@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,10 +22,9 @@ from drivesem.failures.feature_cells import CellVisit
 from drivesem.run.attack import AttackWorker
 from drivesem.run.frame import estimate_photographed_rate, estimate_rate, write_frame
 from drivesem.run.results import PhotographedRate, RunSummary
-from drivesem.run.search_memory import MARGINS, read_margin_rows
+from drivesem.run.search_memory import MARGINS, Experience
 from drivesem.scenes.sources import NoVehicleError
 from drivesem.synth.demo import demo_scene
-from scene_ir import files
 
 
 @pytest.mark.parametrize("options", [{"method": "learn", "passes": 40}, {"method": "random", "queries": 4}])
@@ -54,7 +54,7 @@ def test_layers_are_released_after_a_frame(
     learns = options["method"] == "learn"
     assert (tmp_path / "demo-000" / MARGINS).is_file() is learns
     if learns:
-        assert len(read_margin_rows(tmp_path / "demo-000" / MARGINS)) > 20
+        assert len(Experience.read(tmp_path / "demo-000" / MARGINS).rows) > 20
 
 
 def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
@@ -64,7 +64,7 @@ def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
 
     def stop(worker: AttackWorker, identifier: str, scene: object) -> None:
         assert isinstance(worker.method, Learn)
-        models.append(worker.method.model)
+        models.append(worker.method.knowledge.model if worker.method.knowledge else None)
         raise NoVehicleError("frame", "a vehicle", "none")
 
     monkeypatch.setattr(AttackWorker, "attack_scene", stop)
@@ -76,7 +76,7 @@ def test_a_frame_is_searched_with_what_earlier_frames_of_its_run_know(
         folder = tmp_path / "frames" / f"{number:03}"
         folder.mkdir(parents=True)
         rows = np.random.default_rng(number).random((60, 7)).astype(np.float32)
-        files.write_npz(folder / MARGINS, {"rows": rows})
+        replace(Experience.empty(), rows=rows).write(folder / MARGINS)
     assert [model is None for model in models] == [True, True, True, True, False]
 
 

@@ -319,13 +319,13 @@ class SharedFaultBench:
     ) -> SharedFaultSearch:
         worker, memory = self.workers[method], self.memories.setdefault(fault, SearchMemory())
         if isinstance(worker.method, Learn):
-            worker = replace(worker, method=replace(worker.method, model=memory.model()))
+            worker = replace(worker, method=replace(worker.method, knowledge=memory.knowledge()))
         detector = PlantedDetector(inner, PlantedFault.parse(fault)).requires_grad_(False) if fault else inner
         attacked = replace(worker, detector=detector, grader=build_grader(worker.config, detector)).attack_scene(
             name, scene
         )
-        if attacked.margin_rows is not None:
-            memory.add(name, attacked.margin_rows)
+        if attacked.learns:
+            memory.add(name, attacked.experience)
         certain = certain_losses(attacked)
         seen = detected_without_fault(self.detector, attacked) if certain else ()
         neighbourhoods = tuple(

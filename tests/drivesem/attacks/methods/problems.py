@@ -179,9 +179,10 @@ class Street:
         self.thetas.extend(thetas)
         return torch.stack([self.known_margins(*state) for state in zip(thetas, numbers, strict=True)])
 
-    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor]:
+    def describe(self, theta: Tensor, number: int) -> tuple[Tensor, Tensor, list[tuple[int, ...]]]:
         rows = self.counted_objects.nonzero()[:, 0]
-        return rows, torch.cat([theta[POSITION].reshape(CARS, 2) - LOST_AT, theta[PAINT][:, None]], 1)[rows]
+        features = torch.cat([theta[POSITION].reshape(CARS, 2) - LOST_AT, theta[PAINT][:, None]], 1)[rows]
+        return rows, features, [(int(dark > 0.5),) for dark in theta[WEATHER][:1].expand(len(rows))]
 
     def margins_and_grad(self, theta: Tensor, number: int, weights: Tensor) -> tuple[Tensor, Tensor]:
         self.passes += 3

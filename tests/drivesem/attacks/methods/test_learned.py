@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from drivesem.attacks.methods.learned import Learn, MarginModel
-from drivesem.attacks.methods.margin_search import Climb
-from tests.drivesem.attacks.methods.problems import CARS, DIM, LOST_AT, POSITION, Street
+from drivesem.attacks.methods.learned import Knowledge, Learn, MarginModel
+from drivesem.attacks.methods.margin_search import Climb, UnitBox
+from tests.drivesem.attacks.methods.problems import CARS, DIM, LOST_AT, POSITION, WEATHER, Street
 
 START = torch.zeros(DIM)
 RADIUS = 0.25
@@ -33,6 +33,16 @@ def spot_rows(count: int = 2000) -> np.ndarray:
     return torch.cat([features, margins[:, None]], 1).numpy()
 
 
+def knowledge(
+    rows: np.ndarray | None = None,
+    scenes: list[list[float]] | None = None,
+    failing: set[tuple[int, ...]] | None = None,
+) -> Knowledge:
+    known = torch.tensor(scenes or []).reshape(-1, 2)
+    model = None if rows is None else MarginModel(rows)
+    return Knowledge(model, known, torch.ones(len(known)), frozenset(failing or ()))
+
+
 def lost(method: Climb, seed: int) -> int:
     street = BlindSpot()
     theta = method(street.problem(), START, seed).theta
@@ -42,36 +52,86 @@ def lost(method: Climb, seed: int) -> int:
 def test_what_earlier_frames_met_is_found_in_fewer_passes() -> None:
     seeds = range(6)
     blind = sum(lost(Climb(passes=30), seed) for seed in seeds)
-    knowing = sum(lost(Learn(passes=30, model=MarginModel(spot_rows())), seed) for seed in seeds)
+    knowing = sum(lost(Learn(passes=30, knowledge=knowledge(spot_rows())), seed) for seed in seeds)
     assert knowing >= blind + 4
 
 
-def test_without_a_model_it_is_climb() -> None:
+@pytest.mark.parametrize("known", [None, knowledge()])
+def test_without_knowledge_it_is_climb(known: Knowledge | None) -> None:
     for seed in range(2):
-        one, other = (method(Street().problem(), START, seed) for method in (Climb(40), Learn(40)))
+        one, other = (
+            method(Street().problem(), START, seed) for method in (Climb(40), Learn(40, knowledge=known))
+        )
         assert torch.equal(one.theta, other.theta)
+
+
+@dataclass
+class Night(Street):
+    """Cars are lost in one weather only, wherever they stand, if their paint is dark enough."""
+
+    darkest: float = 2.0
+
+    def known_margins(self, theta: Tensor, number: int) -> Tensor:
+        near = (theta[WEATHER] - torch.tensor([0.9, 0.15])).norm() < 0.05
+        return torch.where(near & (theta[:CARS] < self.darkest), -3.0, 3.0) + 0 * theta.sum()
+
+
+def test_a_weather_that_lost_objects_of_another_frame_is_tried_first() -> None:
+    for rows in (None, spot_rows()):
+        street = Night()
+        theta = Learn(90, knowledge=knowledge(rows, [[0.9, 0.15]]))(street.problem(), START, 0).theta
+        assert int((street.known_margins(theta, 0) < 0).sum()) == CARS
+        assert street.passes == 8, "four proposals, and the best one in four further samples; then it ends"
+
+
+def test_where_an_object_is_left_the_search_goes_on() -> None:
+    street = Night(darkest=-2.0)
+    Learn(90, knowledge=knowledge(None, [[0.9, 0.15]]))(street.problem(), START, 0)
+    assert 75 < street.passes <= 86
+
+
+def test_a_cell_that_fails_already_counts_less() -> None:
+    """Where two weathers lose all cars, the one in an unknown cell is chosen."""
+
+    class Either(Street):
+        def known_margins(self, theta: Tensor, number: int) -> Tensor:
+            return torch.where(theta[WEATHER].sum() > 0, -3.0, 3.0).expand(CARS) + 0 * theta.sum()
+
+    rows = spot_rows()
+    rows[:, -1] = -3.0
+    for cell, dark in (((0,), True), ((1,), False)):
+        known = knowledge(rows, [[0.9, 0.15], [0.1, 0.15]], {cell})
+        theta = Learn(40, knowledge=known)(Either().problem(), START, 0).theta
+        assert bool(theta[WEATHER][0] > 0.5) is dark
+
+
+def test_a_scene_of_another_frame_is_kept_within_the_bounds() -> None:
+    box = UnitBox(Street().problem(), START)
+    theta = box.theta(box.with_scene(box.start, torch.tensor([0.25, 7.0])))
+    assert theta[WEATHER].tolist() == [0.25, 1.0]
+    assert torch.equal(theta[: WEATHER.start], START[: WEATHER.start])
 
 
 @pytest.mark.parametrize("passes", [24, 41])
 def test_it_keeps_within_its_passes(passes: int) -> None:
     street = Street()
-    Learn(passes, model=MarginModel(spot_rows()))(street.problem(), START, 0)
+    Learn(passes, knowledge=knowledge(spot_rows()))(street.problem(), START, 0)
     assert 0 < street.passes <= passes
 
 
 def test_objects_that_do_not_count_are_left_out_of_predictions() -> None:
     street = BlindSpot(counted_objects=torch.tensor([True, False, True, False]))
-    Learn(30, model=MarginModel(spot_rows()))(street.problem(), START, 0)
+    Learn(30, knowledge=knowledge(spot_rows()))(street.problem(), START, 0)
     assert street.passes <= 30
 
 
 def test_points_that_the_model_proposes_are_not_random() -> None:
-    one, other = BlindSpot(), BlindSpot()
-    Learn(60, model=MarginModel(spot_rows()))(one.problem(), START, 0)
-    Learn(60, model=MarginModel(1 - spot_rows()))(other.problem(), START, 0)
-    assert len(one.random) == len(other.random) == 6  # of 24 at the start, 12 of the model
-    distances = [min(float((theta - start).norm()) for start in one.thetas[:12]) for theta in one.random]
-    assert min(distances) > 0
+    street = BlindSpot()
+    Learn(60, knowledge=knowledge(1 - spot_rows()))(street.problem(), START, 0)
+    assert (
+        len(street.random) == 3
+    )  # every second one of seven, after eight passes, the best proposal and eight others
+    assert torch.equal(torch.stack(street.random), torch.stack(street.thetas[18:23:2]))
 
 
 def test_each_tree_predicts_within_the_range_of_margins() -> None:
