@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +33,10 @@ class Experience:
     """(R, F + 1) float32, features and margins, see `SearchLog.margin_rows`."""
     scene: np.ndarray
     """(S,) float32, the scene's coordinates of theta in the counterexample."""
+    objects: np.ndarray
+    """(L, P) float32, those of the objects that are lost for certain in it."""
     cells: np.ndarray
-    """(L, 4) int64, cells of the objects that are lost for certain in it."""
+    """(L, 4) int64, the cells of these objects."""
 
     @classmethod
     def from_search(
@@ -48,37 +50,48 @@ class Experience:
             visits: Cells of the objects, see `SearchLog.visits`.
             certain: Objects that are lost for certain.
         """
-        space = objective.space
-        shared = [theta[where] for parameter, where in space.blocks.items() if not space.owner_count(parameter)]
-        scene = torch.cat(shared).float().cpu().numpy() if shared else np.empty(0, np.float32)
-        cells = [visit.cell for visit in visits if visit.final and visit.index in certain]
-        return cls(objective.search_log.margin_rows(), scene, np.array(cells, int).reshape(-1, len(CELL_EDGES)))
+        space, theta = objective.space, theta.float().cpu()
+        blocks = [(theta[where], space.owner_count(parameter)) for parameter, where in space.blocks.items()]
+        scene = torch.cat([theta[:0], *(block for block, owners in blocks if not owners)])
+        objects = torch.cat(
+            [theta.new_empty(space.count, 0), *(block.view(owners, -1) for block, owners in blocks if owners)], 1
+        )
+        lost = [visit for visit in visits if visit.final and visit.index in certain]
+        cells = np.array([visit.cell for visit in lost], int).reshape(-1, len(CELL_EDGES))
+        return cls(
+            objective.search_log.margin_rows(),
+            scene.numpy(),
+            objects[[visit.index for visit in lost]].numpy(),
+            cells,
+        )
 
     @classmethod
     def empty(cls) -> Experience:
         """Of a frame of which nothing is known."""
-        return cls(
-            np.empty((0, _COLUMNS), np.float32), np.empty(0, np.float32), np.empty((0, len(CELL_EDGES)), int)
-        )
+        rows, scene, objects = (np.empty(shape, np.float32) for shape in ((0, _COLUMNS), 0, (0, 0)))
+        return cls(rows, scene, objects, np.empty((0, len(CELL_EDGES)), int))
 
     @classmethod
     def read(cls, path: Path) -> Experience:
         """Read a frame's file. Raises FormatError for a damaged one."""
         arrays = files.read_npz(path)
         try:
-            rows, scene, cells = (arrays[name] for name in ("rows", "scene", "cells"))
+            rows, scene, objects, cells = (arrays[part.name] for part in fields(cls))
         except KeyError as error:
-            raise FormatError(str(path), "rows, scene and cells", sorted(arrays)) from error
-        shapes = f"rows {rows.shape}, scene {scene.shape}, cells {cells.shape}"
-        if rows.ndim != 2 or rows.shape[1] != _COLUMNS or scene.ndim != 1 or cells.shape[1:] != (len(CELL_EDGES),):
-            raise FormatError(str(path), f"rows (R, {_COLUMNS}), scene (S,), cells (L, {len(CELL_EDGES)})", shapes)
-        if not (np.isfinite(rows).all() and np.isfinite(scene).all()):
+            raise FormatError(str(path), "rows, scene, objects and cells", sorted(arrays)) from error
+        fits = rows.shape[1:] == (_COLUMNS,) and scene.ndim == 1 and objects.ndim == 2
+        if not (fits and cells.shape == (len(objects), len(CELL_EDGES))):
+            shapes = f"rows {rows.shape}, scene {scene.shape}, objects {objects.shape}, cells {cells.shape}"
+            expected = f"rows (R, {_COLUMNS}), scene (S,), objects (L, P), cells (L, {len(CELL_EDGES)})"
+            raise FormatError(str(path), expected, shapes)
+        if not all(np.isfinite(numbers).all() for numbers in (rows, scene, objects)):
             raise FormatError(str(path), "finite numbers", "others")
-        return cls(rows.astype(np.float32), scene.astype(np.float32), cells.astype(int))
+        rows, scene, objects = (numbers.astype(np.float32) for numbers in (rows, scene, objects))
+        return cls(rows, scene, objects, cells.astype(int))
 
     def write(self, path: Path) -> None:
         """Write the frame's file."""
-        files.write_npz(path, {"rows": self.rows, "scene": self.scene, "cells": self.cells})
+        files.write_npz(path, {part.name: getattr(self, part.name) for part in fields(self)})
 
 
 @dataclass
@@ -111,12 +124,11 @@ class SearchMemory:
     def knowledge(self) -> Knowledge:
         """What the frames tell. The same frames tell the same."""
         names = sorted(self._frames)
-        losing = [self._frames[name] for name in names if len(self._frames[name].cells)]
-        scenes = np.stack([one.scene for one in losing]) if losing else np.empty((0, 0), np.float32)
+        losing = [self._frames[name] for name in names if len(self._frames[name].cells)] or [Experience.empty()]
         return Knowledge(
             model=self._fit_model(tuple(names[: len(names) // _FRAMES * _FRAMES])),
-            scenes=torch.from_numpy(scenes),
-            lost=torch.tensor([float(len(one.cells)) for one in losing]),
+            scenes=torch.from_numpy(np.concatenate([np.tile(one.scene, (len(one.cells), 1)) for one in losing])),
+            objects=torch.from_numpy(np.concatenate([one.objects for one in losing])),
             failing=frozenset(tuple(cell) for one in losing for cell in one.cells.tolist()),
         )
 

@@ -270,7 +270,7 @@ class Attack(ABC):
     """Whether it uses `Problem.loss_and_grad`."""
 
     @abstractmethod
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         """Iterates from theta0 (D,), feasible or not. All randomness comes from `generator`."""
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:
@@ -293,7 +293,7 @@ class Attack(ABC):
             seed: of all randomness.
         """
         generator = torch.Generator(device="cpu").manual_seed(seed)
-        proposals = self._propose(problem, theta0, generator)
+        proposals = self.propose(problem, theta0, generator)
         projected: list[ProjectedTheta] = []
         candidates = (theta0, *proposals.thetas)
         for candidate in candidates[-1:] if problem.keep_last else candidates:

@@ -51,7 +51,7 @@ class GradientAscent(Attack):
                 block /= block.abs().sum()
         return normalised
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         start = problem.project(theta0.detach())
         theta, active = start.theta, list(start.active)
         thetas: list[Tensor] = [theta]
@@ -92,7 +92,7 @@ class FGSM(Attack):
     def __post_init__(self) -> None:
         check_counts(steps=self.steps)
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         start = problem.project(theta0.detach())
         loss, gradient = problem.loss_and_grad(start.theta)
         end = problem.project(start.theta + self.steps * problem.step * torch.sign(gradient))
@@ -162,7 +162,7 @@ class APGD(Attack):
         check_counts(steps=self.steps)
         check_rate(self.rate)
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         start = problem.project(theta0.detach())
         active = list(start.active)
 

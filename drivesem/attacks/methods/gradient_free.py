@@ -66,7 +66,7 @@ class Sampling(QuerySearch):
     scipy.stats.qmc).
     """
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         lower, upper = problem.box(theta0, self.steps)
         log = QueryLog(self.queries, self.early_stop)
         points = self._unit_points(len(theta0), generator).to(theta0)
@@ -104,7 +104,7 @@ _MIN_DIMENSIONS = 2
 class CMAES(QuerySearch):
     """CMA-ES from theta0, restarted on convergence. The library gets each sample with the loss of its projection."""
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         lower, upper = problem.box(theta0, self.steps)
         size = upper - lower
         start = ((theta0 - lower) / size.clamp_min(torch.finfo(theta0.dtype).tiny)).detach().cpu().double().numpy()
@@ -162,7 +162,7 @@ class Placebo(Attack):
 
     needs_gradient: ClassVar[bool] = False
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         if len(self.like) != len(theta0):
             raise ShapeError("like", f"({len(theta0)},)", (len(self.like),))
         like = torch.tensor(self.like, dtype=torch.float64).to(theta0) - theta0
@@ -199,7 +199,7 @@ class FixedTheta(Attack):
 
     needs_gradient: ClassVar[bool] = False
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         return Proposals((self.theta,), (None,), 0)
 
     def _rank(self, problem: Problem, theta: Tensor, score: Score) -> tuple[float, ...]:

@@ -7,13 +7,15 @@ And a weather that loses the objects of one frame is a good guess in another one
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from drivesem.attacks.methods.base import GRADIENT_PASSES, MAX_RESCORED, Proposals
+from drivesem.attacks.methods.gradient_ascent import SiFGSM
 from drivesem.attacks.methods.margin_search import (
     MARGIN_CEILING,
     MARGIN_FLOOR,
@@ -36,11 +38,9 @@ _TREES, _TREES_OF_PROPOSAL = 48, 3
 """Trees; and of how many of them a proposal takes the mean. Others of the 48 differ where little is known, so
 proposals spread there (Thompson sampling)."""
 _POOL = 32
-"""Rendered points of which proposals are combined; half of them have scenes of finished frames."""
-_FIRST = 4
+"""Rendered points of which proposals are combined; half of them are transferred from finished frames."""
+_PROPOSALS = 4
 """Proposals that are tried before the search goes on."""
-_LEARNED_SHARE = 0.5
-"""Share of the points of a start that are proposals; wrong knowledge costs no more."""
 _KNOWN_CELL = 0.25
 """What a loss counts in a cell that fails already; elsewhere it counts 1."""
 
@@ -81,80 +81,112 @@ class Knowledge:
     model: MarginModel | None
     """Predicts margins; None while there are too few rows."""
     scenes: Tensor
-    """(M, S), the scene's coordinates of theta in counterexamples."""
-    lost: Tensor
-    """(M,), objects that are lost for certain in each, at least one."""
+    """(L, S), the scene's coordinates of theta in counterexamples, for each object that is lost for certain."""
+    objects: Tensor
+    """(L, P), the coordinates of these objects."""
     failing: frozenset[tuple[int, ...]]
     """Cells of the map in which objects are lost for certain."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Pool:
-    """Points of which proposals are combined."""
+class Learn(Climb):
+    """Tries what finished frames propose, and ends if that loses all objects.
 
-    points: Tensor
-    """(C, K)."""
-    predicted: Tensor
-    """(T, C, N), margins of the objects by each tree; `MARGIN_CEILING` without a model."""
-    weights: Tensor
-    """(C, N), what the loss of an object counts there."""
+    If not, it goes on from there: by si-FGSM where the scene changes and the detector has a gradient, which finds
+    the weather that objects are lost in; else by `Climb`, as gradients do not predict what a new place does.
+    """
+
+    knowledge: Knowledge | None = None
+    """What finished frames tell."""
+
+    def _propose_in(self, search: MarginSearchState, theta0: Tensor) -> Proposals:
+        if not (self.gradient and search.oracle.differentiable and bool((search.box.owner < 0).any())):
+            return Climb._propose_in(self, search, theta0)
+        start, active = theta0, ()
+        tried = self._try_proposals(search)
+        if tried is not None:
+            start, active = search.theta(tried.best)
+            if tried.lost_all:
+                return Proposals((start,), (None,), search.passes, active)
+        steps = (search.passes_left - MAX_RESCORED) // GRADIENT_PASSES
+        ascent = SiFGSM(max(steps, 1)).propose(search.problem, start, search.generator)
+        constraints = tuple(dict.fromkeys((*active, *ascent.active_constraints)))
+        return replace(ascent, queries=search.passes, active_constraints=constraints)
+
+    def _search(self, search: MarginSearchState) -> Tensor:
+        tried = self._try_proposals(search)
+        if tried is None:
+            return Climb._search(self, search)
+        if tried.lost_all:
+            return tried.best
+        count = max(int(START_SHARE * self.passes) - search.passes, 2)
+        points = torch.cat([tried.best[None], sample_points(search, count)])
+        return self._climb(search, points, range(2, len(points), 2))
+
+    def _try_proposals(self, search: MarginSearchState) -> _Trial | None:
+        """Evaluate proposals; None without knowledge."""
+        known = self.knowledge
+        if known is None or (known.model is None and not len(known.scenes)):
+            return None
+        if known.model is None:
+            points = torch.stack([_transfer(known, search, point) for point in sample_points(search, _PROPOSALS)])
+            weights = points.new_ones(_PROPOSALS, 1)
+        else:
+            points, weights = _combine(known, known.model, search)
+        margins = search.margins(list(points), [search.next_sample() for _ in points])
+        best = points[int(_gain(margins, weights.to(margins)).argmax())]
+        return _Trial(best, search.loses_all(best))
 
 
 @dataclass(frozen=True, slots=True)
-class Learn(Climb):
-    """Tries what finished frames propose, and ends if that loses all objects; if not, it climbs from there."""
+class _Trial:
+    """What came of proposals."""
 
-    knowledge: Knowledge | None = None
-    """What finished frames tell; without, it is `Climb`."""
+    best: Tensor
+    """(K,), the best one."""
+    lost_all: bool
+    """Whether all objects are lost there."""
 
-    def _search(self, search: MarginSearchState) -> Tensor:
-        known = self.knowledge
-        if known is None or (known.model is None and not known.scenes.numel()):
-            return Climb._search(self, search)
-        pool = self._build_pool(known, search)
-        count = int(START_SHARE * self.passes)
-        proposals, weights = self._propose_points(search, pool, max(int(_LEARNED_SHARE * count), _FIRST))
-        margins = search.margins(list(proposals[:_FIRST]), [search.next_sample() for _ in range(_FIRST)])
-        best = proposals[int(_gain(margins, weights[:_FIRST].to(margins)).argmax())]
-        if search.loses_all(best):
-            return best
-        learned = torch.cat([best[None], proposals[_FIRST:]])
-        points = torch.cat([learned, sample_points(search, max(count - search.passes - len(learned), 2))])
-        return self._climb(search, points, range(len(learned) + 1, len(points), 2))
 
-    def _build_pool(self, known: Knowledge, search: MarginSearchState) -> _Pool:
-        points = sample_points(search, _POOL)
-        if known.scenes.numel():
-            count = _POOL // 2
-            chosen = known.lost.multinomial(count, count > len(known.lost), generator=search.generator)
-            for place, scene in enumerate(known.scenes[chosen]):
-                points[place] = search.box.with_scene(points[place], scene)
-        weights = points.new_ones(len(points), len(search.oracle.counted_objects))
-        if known.model is None:  # only points with scenes of finished frames
-            return _Pool(points[: _POOL // 2], MARGIN_CEILING * weights[None, : _POOL // 2], weights[: _POOL // 2])
-        described = [search.oracle.describe(search.theta(point)[0], search.next_sample()) for point in points]
-        margins = known.model.predict(torch.cat([features for _, features, _ in described]))
-        predicted = weights.new_full((len(margins), *weights.shape), MARGIN_CEILING)
-        by_point = margins.split([len(rows) for rows, _, _ in described], 1)
-        for place, ((rows, _, cells), own) in enumerate(zip(described, by_point, strict=True)):
-            predicted[:, place, rows.to(predicted.device)] = own.to(predicted)
-            counts = [_KNOWN_CELL if cell in known.failing else 1.0 for cell in cells]
-            weights[place, rows.to(weights.device)] = weights.new_tensor(counts)
-        return _Pool(points, predicted, weights)
+def _transfer(known: Knowledge, search: MarginSearchState, point: Tensor) -> Tensor:
+    """The point u (K,) with the scene of a random counterexample, and each object's coordinates from one, too."""
+    box = search.box
+    theta, owner = box.theta(point), box.theta_owner
+    scene, *donors = torch.randint(len(known.scenes), (2 + int(owner.max()),), generator=search.generator).tolist()
+    theta[owner < 0] = known.scenes[scene].to(theta)
+    for index, donor in enumerate(donors):
+        theta[owner == index] = known.objects[donor].to(theta)
+    return box.point(theta)
 
-    def _propose_points(self, search: MarginSearchState, pool: _Pool, count: int) -> tuple[Tensor, Tensor]:
-        """Points (count, K), and what the loss of an object counts there (count, N)."""
-        points: list[Tensor] = []
-        weights: list[Tensor] = []
-        left = torch.ones(len(pool.points), dtype=torch.bool, device=pool.points.device)
-        for _ in range(count):
-            trees = torch.randperm(len(pool.predicted), generator=search.generator)[:_TREES_OF_PROPOSAL]
-            margins = pool.predicted[trees.to(pool.predicted.device)].mean(0)
-            row = int(torch.where(left, _gain(margins, pool.weights), -1).argmax())
-            left[row] = False
-            points.append(search.combine_objects(pool.points, margins, row))
-            weights.append(pool.weights[row])
-        return torch.stack(points), torch.stack(weights)
+
+def _combine(known: Knowledge, model: MarginModel, search: MarginSearchState) -> tuple[Tensor, Tensor]:
+    """The points (C, K) that promise most, of random and transferred ones; and what the loss of an object counts
+    there (C, N).
+    """
+    points = sample_points(search, _POOL)
+    transferred = _POOL // 2 if len(known.scenes) else 0
+    for place in range(transferred):
+        points[place] = _transfer(known, search, points[place])
+    described = [search.oracle.describe(search.theta(point)[0], search.next_sample()) for point in points]
+    by_tree = model.predict(torch.cat([features for _, features, _ in described]))
+    weights = points.new_ones(len(points), len(search.oracle.counted_objects))
+    predicted = weights.new_full((len(by_tree), *weights.shape), MARGIN_CEILING)
+    by_point = by_tree.split([len(rows) for rows, _, _ in described], 1)
+    for place, ((rows, _, cells), own) in enumerate(zip(described, by_point, strict=True)):
+        predicted[:, place, rows.to(predicted.device)] = own.to(predicted)
+        counts = [_KNOWN_CELL if cell in known.failing else 1.0 for cell in cells]
+        weights[place, rows.to(weights.device)] = weights.new_tensor(counts)
+    proposals: list[Tensor] = []
+    chosen: list[int] = []
+    for number in range(_PROPOSALS):
+        trees = torch.randperm(len(predicted), generator=search.generator)[:_TREES_OF_PROPOSAL]
+        margins = predicted[trees.to(predicted.device)].mean(0)
+        gains = _gain(margins, weights)
+        gains[chosen] = -1
+        whole = transferred and number % 2 == 0  # what failed together is tried together
+        chosen.append(int(gains[: transferred if whole else None].argmax()))
+        proposals.append(points[chosen[-1]] if whole else search.combine_objects(points, margins, chosen[-1]))
+    return torch.stack(proposals), weights[chosen]
 
 
 def _gain(margins: Tensor, weights: Tensor) -> Tensor:

@@ -92,13 +92,9 @@ class UnitBox:
         theta = self._offset + point @ self._matrix
         return torch.minimum(torch.maximum(theta, self._problem.lower), self._problem.upper)
 
-    def with_scene(self, point: Tensor, scene: Tensor) -> Tensor:
-        """The point u (K,) with the scene's coordinates of theta (S,), as far as the bounds allow."""
-        rows, columns = self.owner < 0, self.theta_owner < 0
-        block = self._matrix[rows][:, columns]
-        # each coordinate of the scene spans one of theta
-        own = block @ (scene.to(block) - self._offset[columns]) / block.square().sum(1).clamp_min(1e-12)
-        return point.masked_scatter(rows, own.clamp(0, 1))
+    def point(self, theta: Tensor) -> Tensor:
+        """The point u (K,) of theta (D,) within the bounds; in groups with modes, of the part that they span."""
+        return (self._matrix @ (theta - self._offset) / self._matrix.square().sum(1).clamp_min(1e-12)).clamp(0, 1)
 
     def slope(self, gradient: Tensor) -> Tensor:
         """The gradient (K,) with respect to u, from the gradient (D,) with respect to theta."""
@@ -216,14 +212,19 @@ class MarginSearch(Attack):
     def _search(self, search: MarginSearchState) -> Tensor:
         """The proposed point u (K,). The final `MarginSearchState.select_best` takes FINAL_PASSES."""
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         oracle = problem.margin_oracle
         if oracle is None:
             raise RangeError("problem", "one with margins of its objects", "none")
         if not bool(oracle.counted_objects.any()):
             return Proposals((), (), 0)
         limit = self.passes - _FIXED_PASSES
-        search = MarginSearchState(problem, oracle, UnitBox(problem, theta0), generator, limit)
+        return self._propose_in(
+            MarginSearchState(problem, oracle, UnitBox(problem, theta0), generator, limit), theta0
+        )
+
+    def _propose_in(self, search: MarginSearchState, theta0: Tensor) -> Proposals:
+        """Iterates from theta0 (D,)."""
         theta, active = search.theta(self._search(search))
         return Proposals((theta,), (None,), search.passes, active)
 

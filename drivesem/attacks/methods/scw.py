@@ -72,7 +72,7 @@ class SCW(Attack):
             return problem.size(theta, self.norm)
         return torch.linalg.vector_norm(theta, self.norm)
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         search = _AdamSearch(self, problem, theta0, QueryLog(self.queries, self.early_stop))
         if self.constant is not None:
             search.minimise(self.constant)

@@ -115,7 +115,7 @@ def test_a_unit_step_of_scw():
     problem = Problem(
         loss_and_grad, lambda t: _Projected(t), lambda t: Score(0.0, 0, 0, False, False), step, -step, step
     )
-    end = SGD(1, form="unit")._propose(problem, torch.tensor([1.0, 2.0]), torch.Generator()).thetas[-1]
+    end = SGD(1, form="unit").propose(problem, torch.tensor([1.0, 2.0]), torch.Generator()).thetas[-1]
     assert end.tolist() == pytest.approx([0.76838, 1.55690], abs=1e-4)
 
 

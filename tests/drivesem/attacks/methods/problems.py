@@ -43,7 +43,7 @@ def make_problem(
 
 def propose(method: Attack, problem: Problem, start: Tensor | None = None, seed: int = 0) -> Proposals:
     start = torch.zeros_like(problem.step) if start is None else start
-    return method._propose(problem, start, torch.Generator().manual_seed(seed))
+    return method.propose(problem, start, torch.Generator().manual_seed(seed))
 
 
 class Quadratic:

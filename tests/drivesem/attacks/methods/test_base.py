@@ -103,7 +103,7 @@ class GivenProposals(Attack):
     def __init__(self, thetas: list[list[float]], losses: list[float | None] | None = None) -> None:
         self.thetas, self.losses = thetas, losses or [None] * len(thetas)
 
-    def _propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
+    def propose(self, problem: Problem, theta0: Tensor, generator: torch.Generator) -> Proposals:
         return Proposals(tuple(map(torch.tensor, self.thetas)), tuple(self.losses), queries=len(self.thetas))
 
 

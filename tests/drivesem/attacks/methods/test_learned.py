@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from drivesem.attacks.methods.gradient_ascent import SiFGSM
 from drivesem.attacks.methods.learned import Knowledge, Learn, MarginModel
 from drivesem.attacks.methods.margin_search import Climb, UnitBox
-from tests.drivesem.attacks.methods.problems import CARS, DIM, LOST_AT, POSITION, WEATHER, Street
+from tests.drivesem.attacks.methods.problems import CARS, DIM, LOST_AT, PAINT, POSITION, WEATHER, Street
 
 START = torch.zeros(DIM)
 RADIUS = 0.25
@@ -37,10 +38,13 @@ def knowledge(
     rows: np.ndarray | None = None,
     scenes: list[list[float]] | None = None,
     failing: set[tuple[int, ...]] | None = None,
+    paint: float = 0.0,
 ) -> Knowledge:
+    """Objects that were lost in these scenes stood at 0, 0."""
     known = torch.tensor(scenes or []).reshape(-1, 2)
     model = None if rows is None else MarginModel(rows)
-    return Knowledge(model, known, torch.ones(len(known)), frozenset(failing or ()))
+    objects = torch.tensor([0, 0, paint]).expand(len(known), 3)
+    return Knowledge(model, known, objects, frozenset(failing or ()))
 
 
 def lost(method: Climb, seed: int) -> int:
@@ -57,37 +61,59 @@ def test_what_earlier_frames_met_is_found_in_fewer_passes() -> None:
 
 
 @pytest.mark.parametrize("known", [None, knowledge()])
-def test_without_knowledge_it_is_climb(known: Knowledge | None) -> None:
+def test_without_knowledge_and_gradient_it_is_climb(known: Knowledge | None) -> None:
     for seed in range(2):
         one, other = (
-            method(Street().problem(), START, seed) for method in (Climb(40), Learn(40, knowledge=known))
+            method(Street(differentiable=False).problem(), START, seed)
+            for method in (Climb(40), Learn(40, knowledge=known))
         )
         assert torch.equal(one.theta, other.theta)
 
 
+def test_without_knowledge_it_follows_the_gradient_of_the_scene_as_si_fgsm() -> None:
+    street = Street()
+    problem = replace(street.problem(), loss_and_grad=lambda theta: (0.0, torch.sign(torch.arange(DIM) - 5.5)))
+    one, other = (method.propose(problem, START, torch.Generator()).thetas for method in (Learn(40), SiFGSM(10)))
+    assert torch.equal(torch.stack(one), torch.stack(other))
+
+
 @dataclass
 class Night(Street):
-    """Cars are lost in one weather only, wherever they stand, if their paint is dark enough."""
+    """Cars with dark paint are lost in one weather only, wherever they stand."""
 
-    darkest: float = 2.0
+    darkest: float = -0.4
 
     def known_margins(self, theta: Tensor, number: int) -> Tensor:
         near = (theta[WEATHER] - torch.tensor([0.9, 0.15])).norm() < 0.05
-        return torch.where(near & (theta[:CARS] < self.darkest), -3.0, 3.0) + 0 * theta.sum()
+        return torch.where(near & (theta[PAINT] < self.darkest), -3.0, 3.0) + 0 * theta.sum()
 
 
-def test_a_weather_that_lost_objects_of_another_frame_is_tried_first() -> None:
-    for rows in (None, spot_rows()):
-        street = Night()
-        theta = Learn(90, knowledge=knowledge(rows, [[0.9, 0.15]]))(street.problem(), START, 0).theta
-        assert int((street.known_margins(theta, 0) < 0).sum()) == CARS
-        assert street.passes == 8, "four proposals, and the best one in four further samples; then it ends"
+@pytest.mark.parametrize("differentiable", [False, True])
+@pytest.mark.parametrize("rows", [None, spot_rows()])
+def test_what_lost_objects_of_other_frames_is_tried_first(rows: np.ndarray | None, differentiable: bool) -> None:
+    street = Night(differentiable=differentiable)
+    known = knowledge(rows, [[0.9, 0.15]], paint=-0.5)
+    theta = Learn(90, knowledge=known)(street.problem(), START, 0).theta
+    assert int((street.known_margins(theta, 0) < 0).sum()) == CARS
+    assert street.passes == 8, "four proposals, and the best one in four further samples; then it ends"
 
 
-def test_where_an_object_is_left_the_search_goes_on() -> None:
-    street = Night(darkest=-2.0)
-    Learn(90, knowledge=knowledge(None, [[0.9, 0.15]]))(street.problem(), START, 0)
-    assert 75 < street.passes <= 86
+@pytest.mark.parametrize("differentiable", [False, True])
+def test_where_an_object_is_left_the_search_goes_on(differentiable: bool) -> None:
+    street = Night(differentiable=differentiable, darkest=-2.0)
+    gradients: list[Tensor] = []
+
+    def loss_and_grad(theta: Tensor) -> tuple[float, Tensor]:
+        gradients.append(theta)
+        return 0.0, torch.zeros(DIM)
+
+    problem = replace(street.problem(), loss_and_grad=loss_and_grad)
+    Learn(90, knowledge=knowledge(None, [[0.9, 0.15]]))(problem, START, 0)
+    if differentiable:
+        assert len(gradients) == (90 - 4 - 8 - 5) // 3
+        assert gradients[0][WEATHER].tolist() == pytest.approx([0.9, 0.15])
+    else:
+        assert 75 < street.passes <= 86
 
 
 def test_a_cell_that_fails_already_counts_less() -> None:
@@ -105,11 +131,12 @@ def test_a_cell_that_fails_already_counts_less() -> None:
         assert bool(theta[WEATHER][0] > 0.5) is dark
 
 
-def test_a_scene_of_another_frame_is_kept_within_the_bounds() -> None:
-    box = UnitBox(Street().problem(), START)
-    theta = box.theta(box.with_scene(box.start, torch.tensor([0.25, 7.0])))
-    assert theta[WEATHER].tolist() == [0.25, 1.0]
-    assert torch.equal(theta[: WEATHER.start], START[: WEATHER.start])
+def test_theta_of_another_frame_is_kept_within_the_bounds() -> None:
+    box, theta = UnitBox(Street().problem(), START), torch.linspace(-0.9, 0.9, DIM)
+    theta[WEATHER] = torch.tensor([0.25, 7.0])
+    again = box.theta(box.point(theta))
+    assert again[WEATHER].tolist() == [0.25, 1.0]
+    assert torch.allclose(again[: WEATHER.start], theta[: WEATHER.start])
 
 
 @pytest.mark.parametrize("passes", [24, 41])
@@ -125,13 +152,11 @@ def test_objects_that_do_not_count_are_left_out_of_predictions() -> None:
     assert street.passes <= 30
 
 
-def test_points_that_the_model_proposes_are_not_random() -> None:
-    street = BlindSpot()
+def test_proposals_are_not_random() -> None:
+    street = BlindSpot(differentiable=False)
     Learn(60, knowledge=knowledge(1 - spot_rows()))(street.problem(), START, 0)
-    assert (
-        len(street.random) == 3
-    )  # every second one of seven, after eight passes, the best proposal and eight others
-    assert torch.equal(torch.stack(street.random), torch.stack(street.thetas[18:23:2]))
+    # points of the start come after eight passes and the best proposal
+    assert torch.equal(torch.stack(street.random), torch.stack(street.thetas[10:25:2]))
 
 
 def test_each_tree_predicts_within_the_range_of_margins() -> None:
