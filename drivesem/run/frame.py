@@ -86,7 +86,7 @@ class AttackedScene:
 
     @property
     def experience(self) -> Experience:
-        """What the search tells other frames."""
+        """What other frames learn from the search."""
         certain = [failure.index for failure in certain_losses(self)]
         return Experience.from_search(self.objective, self.search.theta, self.visits, certain)
 

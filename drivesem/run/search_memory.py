@@ -19,7 +19,7 @@ from scene_ir import files
 from scene_ir.errors import FormatError
 
 MARGINS = "margins.npz"
-"""File of what a frame's search tells other frames."""
+"""File of what other frames learn from a frame's search."""
 _FRAMES = 4
 """The model is fitted anew after so many frames."""
 _COLUMNS = len(OBJECT_FEATURES) + 1
@@ -27,7 +27,7 @@ _COLUMNS = len(OBJECT_FEATURES) + 1
 
 @dataclass(frozen=True, slots=True)
 class Experience:
-    """What the search of one frame tells other frames."""
+    """What other frames learn from the search of one."""
 
     rows: np.ndarray
     """(R, F + 1) float32, features and margins, see `SearchLog.margin_rows`."""
@@ -96,7 +96,7 @@ class Experience:
 
 @dataclass
 class SearchMemory:
-    """What finished frames tell, and the model of their margins."""
+    """What finished frames have shown, and the model of their margins."""
 
     _frames: dict[str, Experience] = field(default_factory=dict[str, Experience])
     """By frame."""
@@ -122,7 +122,7 @@ class SearchMemory:
             self.add(path.parent.name, experience)
 
     def knowledge(self) -> Knowledge:
-        """What the frames tell. The same frames tell the same."""
+        """What the frames have shown. The same frames give the same."""
         names = sorted(self._frames)
         losing = [self._frames[name] for name in names if len(self._frames[name].cells)] or [Experience.empty()]
         return Knowledge(

@@ -1,4 +1,4 @@
-"""A search that begins with what finished frames tell.
+"""A search that begins with what finished frames have shown.
 
 A detector's weakness is a region of what it sees, the same in all frames. So margins of one frame's search predict
 those of another frame: trees (extremely randomised, Geurts et al. 2006) are fitted to features of objects as drawn.
@@ -37,8 +37,10 @@ _LOWEST, _HIGHEST = -4.0, 6.0
 _TREES, _TREES_OF_PROPOSAL = 48, 3
 """Trees; and of how many of them a proposal takes the mean. Others of the 48 differ where little is known, so
 proposals spread there (Thompson sampling)."""
-_POOL = 32
-"""Rendered points of which proposals are combined; half of them are transferred from finished frames."""
+_RANDOM, _TRANSFERRED = 8, 8
+"""Rendered points from which proposals come: random ones, and those transferred from finished frames."""
+_ONLY_RANDOM = 32
+"""Their number while there is nothing to transfer."""
 _PROPOSALS = 4
 """Proposals that are tried before the search goes on."""
 _KNOWN_CELL = 0.25
@@ -76,7 +78,7 @@ class MarginModel:
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """What finished frames tell."""
+    """What finished frames have shown."""
 
     model: MarginModel | None
     """Predicts margins; None while there are too few rows."""
@@ -97,7 +99,7 @@ class Learn(Climb):
     """
 
     knowledge: Knowledge | None = None
-    """What finished frames tell."""
+    """What finished frames have shown."""
 
     def _propose_in(self, search: MarginSearchState, theta0: Tensor) -> Proposals:
         if not (self.gradient and search.oracle.differentiable and bool((search.box.owner < 0).any())):
@@ -163,8 +165,8 @@ def _combine(known: Knowledge, model: MarginModel, search: MarginSearchState) ->
     """The points (C, K) that promise most, of random and transferred ones; and what the loss of an object counts
     there (C, N).
     """
-    points = sample_points(search, _POOL)
-    transferred = _POOL // 2 if len(known.scenes) else 0
+    transferred = _TRANSFERRED if len(known.scenes) else 0
+    points = sample_points(search, transferred + _RANDOM if transferred else _ONLY_RANDOM)
     for place in range(transferred):
         points[place] = _transfer(known, search, points[place])
     described = [search.oracle.describe(search.theta(point)[0], search.next_sample()) for point in points]
