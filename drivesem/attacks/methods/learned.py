@@ -37,6 +37,9 @@ _LOWEST, _HIGHEST = -4.0, 6.0
 _TREES, _TREES_OF_PROPOSAL = 48, 3
 """Trees; and of how many of them a proposal takes the mean. Others of the 48 differ where little is known, so
 proposals spread there (Thompson sampling)."""
+_PLAIN = 2
+"""Random points of each frame, whatever is known: the run's rate of misses comes from them, and frames in which the
+search goes on would count more in it with theirs."""
 _RANDOM, _TRANSFERRED = 8, 8
 """Rendered points from which proposals come: random ones, and those transferred from finished frames."""
 _ONLY_RANDOM = 32
@@ -102,6 +105,8 @@ class Learn(Climb):
     """What finished frames have shown."""
 
     def _propose_in(self, search: MarginSearchState, theta0: Tensor) -> Proposals:
+        random = sample_points(search, 2 * _PLAIN)[1::2]
+        search.margins(list(random), [search.next_sample() for _ in random], range(_PLAIN))
         if not (self.gradient and search.oracle.differentiable and bool((search.box.owner < 0).any())):
             return Climb._propose_in(self, search, theta0)
         start, active = theta0, ()
@@ -123,7 +128,7 @@ class Learn(Climb):
             return tried.best
         count = max(int(START_SHARE * self.passes) - search.passes, 2)
         points = torch.cat([tried.best[None], sample_points(search, count)])
-        return self._climb(search, points, range(2, len(points), 2))
+        return self._climb(search, points, ())
 
     def _try_proposals(self, search: MarginSearchState) -> _Trial | None:
         """Evaluate proposals; None without knowledge."""

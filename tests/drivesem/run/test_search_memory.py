@@ -30,8 +30,8 @@ def rows(seed: int, count: int = 100) -> np.ndarray:
 
 
 def experience(seed: int, count: int = 100, cells: Sequence[tuple[int, ...]] = ()) -> Experience:
-    scene = np.full(2, seed, np.float32)
-    return Experience(rows(seed, count), scene, np.array(cells, int).reshape(-1, len(CELL_EDGES)))
+    scene, objects = np.full(2, seed, np.float32), np.full((len(cells), 3), 10 + seed, np.float32)
+    return Experience(rows(seed, count), scene, objects, np.array(cells, int).reshape(-1, len(CELL_EDGES)))
 
 
 def write(folder: Path, frame: str, what: Experience) -> None:
@@ -79,12 +79,12 @@ def test_scenes_are_those_that_lost_objects_and_cells_those_that_fail(tmp_path: 
     memory = SearchMemory()
     memory.read(tmp_path)
     known = memory.knowledge()
-    assert known.scenes.tolist() == [[0, 0], [2, 2]]
-    assert known.lost.tolist() == [2, 1]
+    assert known.scenes.tolist() == [[0, 0], [0, 0], [2, 2]]
+    assert known.objects[:, 0].tolist() == [10, 10, 12]
     assert known.failing == {dark, bright}
 
 
-def test_what_a_search_tells_is_its_scene_and_the_cells_of_certain_losses() -> None:
+def test_others_learn_the_scene_and_the_objects_that_are_lost_for_certain() -> None:
     config = AttackConfig(params="weather,translate", method="learn", grade=False)
     worker = attack.AttackWorker.from_config(config, load_detector("squeezedet"))
     attacked = worker.attack_scene("demo-000", demo_scene(0, 0))
@@ -92,8 +92,10 @@ def test_what_a_search_tells_is_its_scene_and_the_cells_of_certain_losses() -> N
     final = {visit.index: visit.cell for visit in attacked.visits if visit.final}
     found = Experience.from_search(attacked.objective, theta, attacked.visits, list(final)[:2])
     assert found.scene.tolist() == theta[space.blocks[Parameter.WEATHER]].tolist()
+    moved = theta[space.blocks[Parameter.TRANSLATE]].view(space.count, -1)
+    assert found.objects.tolist() == moved[sorted(final)[:2]].tolist()
     assert [tuple(cell) for cell in found.cells.tolist()] == [final[index] for index in sorted(final)[:2]]
-    assert len(found.rows) > 20
+    assert found.rows.shape == (len(attacked.objective.found_before) * 2, COLUMNS)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +106,7 @@ def test_what_a_search_tells_is_its_scene_and_the_cells_of_certain_losses() -> N
         lambda path: replace(experience(0), rows=rows(0)[:, 1:]).write(path),
         lambda path: replace(experience(0), rows=np.full((2, COLUMNS), np.nan)).write(path),
         lambda path: replace(experience(0), scene=np.full(2, np.inf)).write(path),
-        lambda path: replace(experience(0), cells=np.zeros((2, 3), int)).write(path),
+        lambda path: replace(experience(0), cells=np.zeros((2, 4), int)).write(path),
     ],
 )
 def test_a_damaged_file_is_named_and_left_out(
