@@ -124,11 +124,10 @@ class SearchMemory:
     def knowledge(self) -> Knowledge:
         """What the frames have shown. The same frames give the same."""
         names = sorted(self._frames)
-        losing = [self._frames[name] for name in names if len(self._frames[name].cells)] or [Experience.empty()]
+        losing = [self._frames[name] for name in names if len(self._frames[name].cells)]
         return Knowledge(
             model=self._fit_model(tuple(names[: len(names) // _FRAMES * _FRAMES])),
-            scenes=torch.from_numpy(np.concatenate([np.tile(one.scene, (len(one.cells), 1)) for one in losing])),
-            objects=torch.from_numpy(np.concatenate([one.objects for one in losing])),
+            losses=[(torch.from_numpy(one.scene), own) for one in losing for own in torch.from_numpy(one.objects)],
             failing=frozenset(tuple(cell) for one in losing for cell in one.cells.tolist()),
         )
 

@@ -7,6 +7,7 @@ And a weather that loses the objects of one frame is a good guess in another one
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from drivesem.attacks.methods.margin_search import (
     START_SHARE,
     Climb,
     MarginSearchState,
+    UnitBox,
     sample_points,
 )
 
@@ -85,12 +87,16 @@ class Knowledge:
 
     model: MarginModel | None
     """Predicts margins; None while there are too few rows."""
-    scenes: Tensor
-    """(L, S), the scene's coordinates of theta in counterexamples, for each object that is lost for certain."""
-    objects: Tensor
-    """(L, P), the coordinates of these objects."""
+    losses: Sequence[tuple[Tensor, Tensor]]
+    """Of each object that is lost for certain: the scene's coordinates of theta (S,), and its own (P,)."""
     failing: frozenset[tuple[int, ...]]
     """Cells of the map in which objects are lost for certain."""
+
+    def for_box(self, box: UnitBox) -> Knowledge | None:
+        """What is of use in a box: losses with as many coordinates. None if there is nothing."""
+        sizes = [int((box.theta_owner == owner).sum()) for owner in (-1, 0)]
+        losses = [loss for loss in self.losses if [len(part) for part in loss] == sizes]
+        return None if self.model is None and not losses else replace(self, losses=losses)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +138,8 @@ class Learn(Climb):
 
     def _try_proposals(self, search: MarginSearchState) -> _Trial | None:
         """Evaluate proposals; None without knowledge."""
-        known = self.knowledge
-        if known is None or (known.model is None and not len(known.scenes)):
+        known = None if self.knowledge is None else self.knowledge.for_box(search.box)
+        if known is None:
             return None
         if known.model is None:
             points = torch.stack([_transfer(known, search, point) for point in sample_points(search, _PROPOSALS)])
@@ -159,10 +165,11 @@ def _transfer(known: Knowledge, search: MarginSearchState, point: Tensor) -> Ten
     """The point u (K,) with the scene of a random counterexample, and each object's coordinates from one, too."""
     box = search.box
     theta, owner = box.theta(point), box.theta_owner
-    scene, *donors = torch.randint(len(known.scenes), (2 + int(owner.max()),), generator=search.generator).tolist()
-    theta[owner < 0] = known.scenes[scene].to(theta)
+    count = int(owner.max()) + 1
+    scene, *donors = torch.randint(len(known.losses), (1 + count,), generator=search.generator).tolist()
+    theta[owner < 0] = known.losses[scene][0].to(theta)
     for index, donor in enumerate(donors):
-        theta[owner == index] = known.objects[donor].to(theta)
+        theta[owner == index] = known.losses[donor][1].to(theta)
     return box.point(theta)
 
 
@@ -170,7 +177,7 @@ def _combine(known: Knowledge, model: MarginModel, search: MarginSearchState) ->
     """The points (C, K) that promise most, of random and transferred ones; and what the loss of an object counts
     there (C, N).
     """
-    transferred = _TRANSFERRED if len(known.scenes) else 0
+    transferred = _TRANSFERRED if known.losses else 0
     points = sample_points(search, transferred + _RANDOM if transferred else _ONLY_RANDOM)
     for place in range(transferred):
         points[place] = _transfer(known, search, points[place])

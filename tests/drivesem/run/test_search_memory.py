@@ -79,8 +79,8 @@ def test_scenes_are_those_that_lost_objects_and_cells_those_that_fail(tmp_path: 
     memory = SearchMemory()
     memory.read(tmp_path)
     known = memory.knowledge()
-    assert known.scenes.tolist() == [[0, 0], [0, 0], [2, 2]]
-    assert known.objects[:, 0].tolist() == [10, 10, 12]
+    found = [(scene.tolist(), own.tolist()) for scene, own in known.losses]
+    assert found == [([0, 0], [10, 10, 10])] * 2 + [([2, 2], [12, 12, 12])]
     assert known.failing == {dark, bright}
 
 

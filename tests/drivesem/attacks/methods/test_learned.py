@@ -41,10 +41,9 @@ def knowledge(
     paint: float = 0.0,
 ) -> Knowledge:
     """Objects that were lost in these scenes stood at 0, 0."""
-    known = torch.tensor(scenes or []).reshape(-1, 2)
+    losses = [(torch.tensor(scene), torch.tensor([0.0, 0.0, paint])) for scene in scenes or []]
     model = None if rows is None else MarginModel(rows)
-    objects = torch.tensor([0, 0, paint]).expand(len(known), 3)
-    return Knowledge(model, known, objects, frozenset(failing or ()))
+    return Knowledge(model, losses, frozenset(failing or ()))
 
 
 def lost(method: Climb, seed: int) -> int:
@@ -94,6 +93,15 @@ def test_what_lost_objects_of_other_frames_is_tried_first(rows: np.ndarray | Non
     theta = Learn(90, knowledge=known)(street.problem(), START, 0).theta
     assert int((street.known_margins(theta, 0) < 0).sum()) == CARS
     assert street.passes == 10, "two random points, four proposals, the best one in four further samples"
+
+
+def test_losses_with_other_coordinates_are_of_no_use() -> None:
+    box, known = UnitBox(Street().problem(), START), knowledge(None, [[0.9, 0.15]])
+    other = (torch.zeros(2), torch.zeros(8))
+    both = replace(known, losses=[*known.losses, other]).for_box(box)
+    assert both is not None
+    assert both.losses == list(known.losses)
+    assert replace(known, losses=[other]).for_box(box) is None
 
 
 @pytest.mark.parametrize("differentiable", [False, True])
