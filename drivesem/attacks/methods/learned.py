@@ -48,6 +48,8 @@ _ONLY_RANDOM = 32
 """Their number while there is nothing to transfer."""
 _PROPOSALS = 4
 """Proposals that are tried before the search goes on."""
+_LEARNED_SHARE = 0.5
+"""Share of the points of a start that the model proposes where the scene does not change."""
 _REST = 0.5
 """Share of the passes left that si-FGSM takes from a proposal: it is nearer to a failure than the photograph."""
 _KNOWN_CELL = 0.25
@@ -95,18 +97,21 @@ class Knowledge:
     """Cells of the map in which objects are lost for certain."""
 
     def for_box(self, box: UnitBox) -> Knowledge | None:
-        """What is of use in a box: losses with as many coordinates. None if there is nothing."""
+        """What is of use in a box: where the scene changes, losses with as many coordinates. None if there is
+        nothing.
+        """
         sizes = [int((box.theta_owner == owner).sum()) for owner in (-1, 0)]
-        losses = [loss for loss in self.losses if [len(part) for part in loss] == sizes]
+        losses = [loss for loss in self.losses if sizes[0] and [len(part) for part in loss] == sizes]
         return None if self.model is None and not losses else replace(self, losses=losses)
 
 
 @dataclass(frozen=True, slots=True)
 class Learn(Climb):
-    """Tries what finished frames propose, and ends if that loses all objects.
+    """Where the scene changes, it tries what lost objects of finished frames, and ends if that loses all objects. If
+    not, si-FGSM goes on from there, which finds the weather that objects are lost in; without a gradient, `Climb`.
 
-    If not, it goes on from there: by si-FGSM where the scene changes and the detector has a gradient, which finds
-    the weather that objects are lost in; else by `Climb`, as gradients do not predict what a new place does.
+    Where the scene does not change, it is `Climb` with a start that the model proposes half of: gradients do not
+    predict what a new place does.
     """
 
     knowledge: Knowledge | None = None
@@ -118,10 +123,11 @@ class Learn(Climb):
         if not (self.gradient and search.oracle.differentiable and bool((search.box.owner < 0).any())):
             return Climb._propose_in(self, search, theta0)
         start, active, steps = theta0, (), (search.passes_left - MAX_RESCORED) // GRADIENT_PASSES
-        tried = self._try_proposals(search)
-        if tried is not None:
-            start, active = search.theta(tried.best)
-            if tried.lost_all:
+        known = self._known(search)
+        if known is not None and known.losses:
+            best, lost_all = _try_proposals(known, search)
+            start, active = search.theta(best)
+            if lost_all:
                 return Proposals((start,), (None,), search.passes, active)
             steps = int(_REST * (search.passes_left - MAX_RESCORED)) // GRADIENT_PASSES
         ascent = SiFGSM(max(steps, 1)).propose(search.problem, start, search.generator)
@@ -129,38 +135,29 @@ class Learn(Climb):
         return replace(ascent, queries=search.passes, active_constraints=constraints)
 
     def _search(self, search: MarginSearchState) -> Tensor:
-        tried = self._try_proposals(search)
-        if tried is None:
+        known, count = self._known(search), int(START_SHARE * self.passes)
+        if known is None:
             return Climb._search(self, search)
-        if tried.lost_all:
-            return tried.best
-        count = max(int(START_SHARE * self.passes) - search.passes, 2)
-        points = torch.cat([tried.best[None], sample_points(search, count)])
+        if known.losses:
+            best, lost_all = _try_proposals(known, search)
+            if lost_all:
+                return best
+            learned = best[None]
+        else:
+            learned, _ = _propose_points(known, search, int(_LEARNED_SHARE * count))
+        points = torch.cat([learned, sample_points(search, max(count - search.passes - len(learned), 2))])
         return self._climb(search, points, ())
 
-    def _try_proposals(self, search: MarginSearchState) -> _Trial | None:
-        """Evaluate proposals; None without knowledge."""
-        known = None if self.knowledge is None else self.knowledge.for_box(search.box)
-        if known is None:
-            return None
-        if known.model is None:
-            points = torch.stack([_transfer(known, search, point) for point in sample_points(search, _PROPOSALS)])
-            weights = points.new_ones(_PROPOSALS, 1)
-        else:
-            points, weights = _combine(known, known.model, search)
-        margins = search.margins(list(points), [search.next_sample() for _ in points])
-        best = points[int(_gain(margins, weights.to(margins)).argmax())]
-        return _Trial(best, search.loses_all(best))
+    def _known(self, search: MarginSearchState) -> Knowledge | None:
+        return None if self.knowledge is None else self.knowledge.for_box(search.box)
 
 
-@dataclass(frozen=True, slots=True)
-class _Trial:
-    """What came of proposals."""
-
-    best: Tensor
-    """(K,), the best one."""
-    lost_all: bool
-    """Whether all objects are lost there."""
+def _try_proposals(known: Knowledge, search: MarginSearchState) -> tuple[Tensor, bool]:
+    """The best one (K,) of a few proposals, and whether it loses all objects."""
+    points, weights = _propose_points(known, search, _PROPOSALS)
+    margins = search.margins(list(points), [search.next_sample() for _ in points])
+    best = points[int(_gain(margins, weights.to(margins)).argmax())]
+    return best, search.loses_all(best)
 
 
 def _transfer(known: Knowledge, search: MarginSearchState, point: Tensor) -> Tensor:
@@ -175,10 +172,14 @@ def _transfer(known: Knowledge, search: MarginSearchState, point: Tensor) -> Ten
     return box.point(theta)
 
 
-def _combine(known: Knowledge, model: MarginModel, search: MarginSearchState) -> tuple[Tensor, Tensor]:
+def _propose_points(known: Knowledge, search: MarginSearchState, count: int) -> tuple[Tensor, Tensor]:
     """The points (C, K) that promise most, of random and transferred ones; and what the loss of an object counts
     there (C, N).
     """
+    model = known.model
+    if model is None:
+        points = torch.stack([_transfer(known, search, point) for point in sample_points(search, count)])
+        return points, points.new_ones(count, 1)
     transferred = _TRANSFERRED if known.losses else 0
     points = sample_points(search, transferred + _RANDOM if transferred else _ONLY_RANDOM)
     for place in range(transferred):
@@ -194,7 +195,7 @@ def _combine(known: Knowledge, model: MarginModel, search: MarginSearchState) ->
         weights[place, rows.to(weights.device)] = weights.new_tensor(counts)
     proposals: list[Tensor] = []
     chosen: list[int] = []
-    for number in range(_PROPOSALS):
+    for number in range(count):
         trees = torch.randperm(len(predicted), generator=search.generator)[:_TREES_OF_PROPOSAL]
         margins = predicted[trees.to(predicted.device)].mean(0)
         gains = _gain(margins, weights)
