@@ -40,8 +40,8 @@ _TREES, _TREES_OF_PROPOSAL = 48, 3
 """Trees; and of how many of them a proposal takes the mean. Others of the 48 differ where little is known, so
 proposals spread there (Thompson sampling)."""
 _PLAIN = 2
-"""Random points of each frame, whatever is known: the run's rate of misses comes from them, and frames in which the
-search goes on would count more in it with theirs."""
+"""Random points of each frame, for the run's rate of misses. More of them in frames in which the search goes on would
+bias it."""
 _RANDOM, _TRANSFERRED = 8, 8
 """Rendered points from which proposals come: random ones, and those transferred from finished frames."""
 _ONLY_RANDOM = 32
