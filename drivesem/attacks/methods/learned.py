@@ -82,6 +82,8 @@ class MarginModel:
             (T, K) margins.
         """
         inputs = features.float().numpy()
+        if not len(inputs):
+            return torch.empty(_TREES, 0)
         return torch.from_numpy(np.stack([tree.predict(inputs) for tree in self._trees.estimators_]))
 
 

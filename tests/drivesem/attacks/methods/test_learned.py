@@ -170,6 +170,7 @@ def test_each_tree_predicts_within_the_range_of_margins() -> None:
     rows[::7, -1] = -1e3
     predicted = MarginModel(rows).predict(torch.from_numpy(rows[:5, :-1]))
     assert predicted.shape[1:] == (5,)
+    assert MarginModel(rows).predict(torch.empty(0, 3)).shape == (len(predicted), 0)
     assert len(predicted) > 10
     assert -4 <= float(predicted.min()) <= float(predicted.max()) <= 6
 
