@@ -43,4 +43,4 @@ def test_few_calls_lie_between_the_command_and_a_loss(tmp_path: Path, monkeypatc
     for stack in gradients:
         assert stack[-1] == "main"
         assert len(stack) + 1 <= MAX_DEPTH, stack
-        assert stack.index("_propose") <= MAX_GRADIENT_FUNCTIONS, stack
+        assert stack.index("propose") <= MAX_GRADIENT_FUNCTIONS, stack
