@@ -137,7 +137,7 @@ def test_a_cell_that_fails_already_counts_less() -> None:
         assert bool(theta[WEATHER][0] > 0.5) is dark
 
 
-def test_theta_of_another_frame_is_kept_within_the_bounds() -> None:
+def test_theta_of_another_frame_stays_within_the_bounds() -> None:
     box, theta = UnitBox(Street().problem(), START), torch.linspace(-0.9, 0.9, DIM)
     theta[WEATHER] = torch.tensor([0.25, 7.0])
     again = box.theta(box.point(theta))
