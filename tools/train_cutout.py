@@ -207,7 +207,7 @@ def make(
     for first in range(0, frames, CHUNK):
         part = folder / f"{first:05d}"
         facts = {"seed": seed, "split": split, "assets": assets is not None, "generator": GENERATOR_VERSION}
-        facts |= {"people": "varied"} if people else {}
+        facts |= {"people": "varied, with prams"} if people else {}
         facts["frames"] = min(CHUNK, frames - first)
         made.append(part)
         if (part / "made.json").is_file() and files.read_json(part / "made.json") == facts:
@@ -702,7 +702,7 @@ PEOPLE_CARD = {
     "guide": "a thin upright box that fills the label's 2D box",
     "start": "Trained on from `cutout.safetensors`.",
     "variety": """Varied people
-  (coats, skirts, hats, bags, children, people side by side, riders of motorcycles) in boxes with sides that are off as
+  (coats, skirts, hats, bags, prams, children, people side by side, riders of motorcycles) in boxes with sides off as
   drawn by hand, more, and less. Clothes with folds and patterns.""",
     "off": "4% of the box's sides",
     "limits": """On photographs it is unsure of very bright clothes and of people under 40 px high, and leaves out what

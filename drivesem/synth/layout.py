@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drivesem.synth.people import PRAM_LENGTH_M
 from drivesem.synth.soup import Material
 
 if TYPE_CHECKING:
@@ -214,12 +215,17 @@ class Road:
         return float(base + self.curvature * s)
 
 
+PUSHES_PRAM = 2
+"""Variant of a varied person who pushes a pram."""
+
+
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """A vehicle or person. position_xz, yaw: world; size_lhw m; paint: linear albedo; seed: of its own details.
-    lane_ds: road coordinates (d, s) m where it follows the road, speed_mps: along s, below 0 against it. track:
-    its number within the scene. ffd: lattice offsets (192,) that bend its shape, as fractions of the unit box, or
-    None. lamps: code in [-1, 1]: off, as the weather makes drivers do it, brake lamps.
+    """A vehicle or person. variant: of the shape; a person's is 0, 1 if varied, `PUSHES_PRAM` with a pram too.
+    position_xz, yaw: world; size_lhw m; paint: linear albedo; seed: of its own details. lane_ds: road coordinates
+    (d, s) m where it follows the road, speed_mps: along s, below 0 against it. track: its number within the scene.
+    ffd: lattice offsets (192,) that bend its shape, as fractions of the unit box, or None. lamps: code in [-1, 1]:
+    off, as the weather makes drivers do it, brake lamps.
     """
 
     kind: str
@@ -751,11 +757,15 @@ _TOGETHER_SHARE, _TOGETHER_M = 0.4, 0.9
 """Share of varied pedestrians who walk next to the one before, and how far apart they are, m."""
 
 
+_PRAM_SHARE = 0.12
+"""Share of varied grown pedestrians who push a pram."""
+
+
 def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor], varied: bool = False) -> list[Actor]:
     """Pedestrians on pavements (some crossing the road) and cyclists near the road's edge, clear of vehicles.
 
-    varied: children and people who walk side by side too, in the clothes and with the bags of `people.pedestrian`,
-    and riders of motorcycles.
+    varied: children, people who walk side by side and people with prams too, in the clothes and with the bags of
+    `people.pedestrian`, and riders of motorcycles.
     """
     wanted = ["pedestrian"] * int(rng.choice([0, 1, 2, 3, 5, 8], p=[0.45, 0.2, 0.15, 0.1, 0.06, 0.04]))
     wanted += ["cyclist"] * int(rng.choice([0, 1, 2, 3], p=[0.62, 0.24, 0.1, 0.04]))
@@ -783,9 +793,12 @@ def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor], va
                 d += float(rng.normal(0, 0.4))
                 yaw = road.yaw(s, side) + float(rng.normal(0, 0.15))
             height = float(rng.normal(1.75, 0.09))
+            variant, length = int(varied), 0.85 if kind == "pedestrian" else 1.77
             if varied and kind == "pedestrian" and rng.random() < _CHILD_SHARE:
                 height = float(rng.uniform(*_CHILD_M))
-            size = (0.85 if kind == "pedestrian" else 1.77, height, 0.65 if kind == "pedestrian" else 0.6)
+            elif varied and kind == "pedestrian" and rng.random() < _PRAM_SHARE:
+                variant, length = PUSHES_PRAM, PRAM_LENGTH_M * height / 1.75
+            size = (length, height, 0.65 if kind == "pedestrian" else 0.6)
             x, z = (float(v) for v in road.point(d, s))
             if varied and kind == "pedestrian" and actors and rng.random() < _TOGETHER_SHARE:
                 (x, z), yaw = actors[-1].position_xz, actors[-1].yaw
@@ -795,6 +808,6 @@ def place_people(rng: np.random.Generator, road: Road, vehicles: list[Actor], va
                 outlines.append(outline)
                 yaw = float((yaw + np.pi) % (2 * np.pi) - np.pi)
                 seed = int(rng.integers(2**31))
-                actors.append(Actor(kind, int(varied), (x, z), yaw, size, (0.0, 0.0, 0.0), False, seed))
+                actors.append(Actor(kind, variant, (x, z), yaw, size, (0.0, 0.0, 0.0), False, seed))
                 break
     return actors

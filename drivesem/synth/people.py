@@ -1,7 +1,7 @@
 """Simple articulated people and riders for training scenes, built from tubes and balls.
 
-Varied people also wear coats, skirts, hats and long hair, carry bags, hold their arms in other ways, and ride
-motorcycles.
+Varied people also wear coats, skirts, hats and long hair, carry bags, push prams, hold their arms in other ways, and
+ride motorcycles.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivesem.synth.soup import Material, Soup, ball, join, stick
+from drivesem.synth.soup import Material, Soup, ball, join, placed, stick
 
 _SKIN = np.array([[0.50, 0.30, 0.20], [0.62, 0.40, 0.29], [0.28, 0.15, 0.09], [0.42, 0.25, 0.16]], np.float32)
 _CLOTH = np.array(
@@ -117,8 +117,47 @@ def _bags(rng: np.random.Generator, hip: np.ndarray, shoulder: np.ndarray, hands
     return []
 
 
-def pedestrian(rng: np.random.Generator, varied: bool = False) -> Soup:
-    """A person 1.75 m tall facing +x, feet on the ground, standing or walking, in random clothes."""
+_HANDLE = np.array([0.40, -1.02, 0.0])
+"""Middle of a pram's handle, m before the feet of who pushes it."""
+PRAM_LENGTH_M = 1.75
+"""Length of a person 1.75 m tall with a pram."""
+_BEFORE_PRAM_M = 0.5
+"""How far who pushes a pram is behind the middle of both."""
+
+
+def _pram(rng: np.random.Generator) -> list[Soup]:
+    """A pram with a hood or a pushchair with a seat, at `_HANDLE`, wheels on the ground."""
+    cloth, lining = _pick(_CLOTH, rng), _pick(_CLOTH, rng)
+    rubber, steel = np.full(3, 0.02, np.float32), np.full(3, 0.25, np.float32)
+    radius, half = float(rng.uniform(0.08, 0.15)), float(rng.uniform(0.2, 0.26))
+    lying = rng.random() < 0.5
+    across = np.array([0.0, 0.0, half])
+    parts = [stick(_HANDLE - across, _HANDLE + across, (0.018, 0.018), Material.CLOTH, rubber, 5)]
+    for side in (-across, across):
+        back, front = np.array([0.62, -radius, 0.0]) + side, np.array([1.08, -radius, 0.0]) + side
+        knee = np.array([0.72, -0.52, 0.0]) + side
+        for start, end in ((_HANDLE + side, knee), (knee, front), (knee, back)):
+            parts.append(stick(start, end, (0.014, 0.014), Material.METAL, steel, 4))
+        parts += [ball(wheel, (radius, radius, 0.025), Material.CLOTH, rubber, 1) for wheel in (back, front)]
+    width = half - 0.02
+    if lying:
+        hood = np.array([float(rng.choice([0.68, 1.02])), -0.82, 0.0])
+        parts.append(ball(np.array([0.85, -0.66, 0.0]), (0.40, 0.16, width), Material.CLOTH, cloth, 1))
+        parts.append(ball(hood, (0.24, 0.26, width), Material.CLOTH, lining, 1))
+    else:
+        seat, top = np.array([0.92, -0.48, 0.0]), np.array([0.66, -0.98, 0.0])
+        parts.append(ball(seat, (0.22, 0.09, width), Material.CLOTH, cloth, 1))
+        parts.append(stick(seat - np.array([0.1, 0, 0]), top, (width, width * 0.9), Material.CLOTH, cloth, 8))
+        parts.append(ball(top + np.array([0.12, 0.0, 0.0]), (0.24, 0.12, width), Material.CLOTH, lining, 1))
+        parts.append(ball(seat + np.array([0.0, -0.22, 0.0]), (0.11, 0.17, 0.12), Material.CLOTH, lining, 1))
+    return parts
+
+
+def pedestrian(rng: np.random.Generator, varied: bool = False, pram: bool = False) -> Soup:
+    """A person 1.75 m tall facing +x, feet on the ground, standing or walking, in random clothes.
+
+    pram: pushes one; then the origin is below the middle of both.
+    """
     shirt, trousers, skin, hair = _pick(_CLOTH, rng), _pick(_CLOTH, rng), _pick(_SKIN, rng), _pick(_HAIR, rng)
     shoes = np.full(3, 0.03, np.float32)
     stride = float(rng.choice([0.08, 0.35, 0.5])) * float(rng.uniform(0.7, 1.1))
@@ -136,6 +175,9 @@ def pedestrian(rng: np.random.Generator, varied: bool = False) -> Soup:
         start = shoulder + np.array([0, 0, side * 0.205])
         bend = float(rng.uniform(0.1, 2.2)) if varied and rng.random() < 0.5 else 0.3
         arm = _swing(start, (-swing * 0.9, -swing * 0.9 + bend), (0.29, 0.27))
+        if pram:
+            reach = _HANDLE + np.array([0.0, 0.0, side * 0.17])
+            arm = [start, (start + reach) / 2 + np.array([-0.05, 0.08, side * 0.03]), reach]
         hands.append(arm[-1])
         parts += _limb(arm, (0.06, 0.048, 0.04), skin if bare else shirt)
         parts.append(ball(arm[-1], (0.05, 0.06, 0.04), Material.CLOTH, skin, 0))
@@ -146,6 +188,8 @@ def pedestrian(rng: np.random.Generator, varied: bool = False) -> Soup:
         parts.append(
             ball(shoulder + np.array([-0.16, 0.2, 0]), (0.11, 0.22, 0.15), Material.CLOTH, _pick(_CLOTH, rng))
         )
+    if pram:
+        return placed(join([*parts, *_pram(rng)]), (-_BEFORE_PRAM_M, 0.0, 0.0), 0.0, (1.0, 1.0, 1.0))
     return join(parts)
 
 

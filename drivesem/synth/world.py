@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from drivesem.synth import buildings, flora, furniture, people, vehicles
-from drivesem.synth.layout import Actor, Road
+from drivesem.synth.layout import PUSHES_PRAM, Actor, Road
 from drivesem.synth.soup import Material, Semantic, Soup, box, join, make, placed, quad, stick, tagged
 
 _STATIONS_M = np.array([-14, -8, -4, 0, 4, 8, 12, 18, 24, 32, 40, 50, 62, 76, 92, 110, 135, 165, 200.0])
@@ -657,7 +657,9 @@ def actor_soup(actor: Actor, owner: int, distance_m: float = 0.0) -> Soup:
     """
     if actor.label in ("Pedestrian", "Cyclist"):
         rng = np.random.default_rng([0x9E0, actor.seed])
-        figure = (people.pedestrian if actor.kind == "pedestrian" else people.cyclist)(rng, actor.variant > 0)
+        varied, pram = actor.variant > 0, actor.variant == PUSHES_PRAM
+        pedestrian = actor.kind == "pedestrian"
+        figure = people.pedestrian(rng, varied, pram) if pedestrian else people.cyclist(rng, varied)
         scale = actor.size_lhw[1] / 1.75
         soup = placed(figure, (0, 0, 0), 0.0, (scale, scale, scale))
     else:

@@ -34,11 +34,11 @@ _MIN_REST = 0.05
 _SEAM = 0.06
 """Width of the border along which a person's fill takes the colours around it, in heights."""
 _NEAR_THIN = (1.0, 0.5)
-"""Range around a person from which parts are copied, across and down, in heights."""
+"""Range around a person that is continued, across and down, in heights."""
 _MAX_UNKNOWN = 0.8
-"""Share of that range, of the person and of all others, above which there is too little to copy."""
+"""Share of that range, of the person and of all others, above which there is too little to continue."""
 _MAX_THIN_PX = 100
-"""Height up to which a person's fill is searched at full size; the time grows with its area squared."""
+"""Height up to which a person's fill has its full size; the time grows with the area."""
 _BORDER_PX = 5
 """Pixels this near to vehicles and shadows are not copied: their colours are mixed, and masks have errors."""
 
@@ -54,7 +54,9 @@ class BackgroundInputs:
     camera: Camera
     """The photograph's camera."""
     excluded: Mask
-    """(H, W), labelled objects that are no vehicles: not copied."""
+    """(H, W), labels that are neither objects nor vehicles: not copied."""
+    people: Mask
+    """(H, W), labelled people who stay: not continued behind others."""
     occluder_opacity: Array
     """(H, W) in [0, 1], opacity of the occluders."""
     maps: Segmentation
@@ -72,6 +74,7 @@ class BackgroundInputs:
             self.ground,
             Camera(matrix[:, :3].clone(), height, width, matrix),
             _scale_mask(self.excluded, shrink),
+            _scale_mask(self.people, shrink),
             _scale_down(self.occluder_opacity, shrink),
             Segmentation(*(_scale_down(getattr(self.maps, f.name), shrink) for f in fields(Segmentation))),
         )
@@ -148,33 +151,33 @@ class BackgroundFill:
         filled = self._fill_hole(_scale_mask(hole, self._work.shrink), seed)
         return filled if self._work is self._full else self._full.enlarge(filled, hole)
 
-    def fill_thin(self, filled: Array, thin: Mask) -> Array:
-        """The image (H, W, 3) with what stood before it filled by shifted parts of what is near (He and Sun 2012), as
-        suits objects that are narrower than what they hide.
+    def fill_thin(self, filled: Array, thin: Mask, others: Mask) -> Array:
+        """The image (H, W, 3) with lines and textures from around a person continued behind it (frequency selective
+        reconstruction, Genser et al. 2018), as suits objects that are narrower than what they hide.
 
         Args:
             filled: The image, filled otherwise.
             thin: Pixels (H, W) of one person.
+            others: Pixels (H, W) of people that are to be filled after this one.
         """
         x0, y0, x1, y1 = mask_bounds(thin)
         across, down = (round(reach * (y1 - y0)) for reach in _NEAR_THIN)
         window = (slice(max(y0 - down, 0), y1 + down), slice(max(x0 - across, 0), x1 + across))
         inputs, hole = self._full.inputs, thin[window]
-        unknown = hole | inputs.excluded[window] | (inputs.maps.person[window] > _PERSON_SHARE)
+        unknown = hole | others[window] | inputs.people[window] | (inputs.maps.person[window] > _PERSON_SHARE)
         if unknown.mean() > _MAX_UNKNOWN:
             return filled
         height, width = hole.shape
         scale = min(1.0, _MAX_THIN_PX / (y1 - y0))
         size = (max(round(scale * width), 1), max(round(scale * height), 1))
-        small = cv2.resize(filled[window], size, interpolation=cv2.INTER_AREA)
-        lab = cv2.cvtColor(np.rint(small * 255).astype(np.uint8), cv2.COLOR_RGB2Lab)
+        small = np.rint(cv2.resize(filled[window], size, interpolation=cv2.INTER_AREA) * 255).astype(np.uint8)
         known = cv2.resize(unknown.astype(np.float32), size, interpolation=cv2.INTER_AREA) == 0
-        cv2.xphoto.inpaint(lab, known.astype(np.uint8) * 255, moved := lab.copy(), cv2.xphoto.INPAINT_SHIFTMAP)
-        moved = cv2.cvtColor(moved, cv2.COLOR_Lab2RGB).astype(np.float32) / 255
+        cv2.xphoto.inpaint(small, known.astype(np.uint8) * 255, found := small.copy(), cv2.xphoto.INPAINT_FSR_FAST)
         image = filled.copy()
-        full = np.clip(cv2.resize(moved, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
+        continued = cv2.resize(found.astype(np.float32) / 255, (width, height), interpolation=cv2.INTER_CUBIC)
         around = push_pull(filled[window], 1 - unknown.astype(np.float32))  # without the colours of other people
-        patched = np.where(hole[..., None], full, np.where(unknown[..., None], around, filled[window]))
+        patched = np.where(unknown[..., None], around, filled[window])
+        patched[hole] = np.clip(continued[hole], 0, 1)
         hidden = _hide_seam(patched.astype(np.float32), hole, _SEAM * (y1 - y0))
         image[window] = np.where(hole[..., None], hidden, filled[window])
         return image

@@ -181,11 +181,14 @@ def derender(frame: Frame, settings: DerenderSettings | None = None) -> SceneIR:
     # Background, mattes and shadows.
     maps = segmentation.segment_photograph(image, ground, camera, settings.segmenter)
     maps = segmentation.apply_frame_classes(frame, maps).outside(ego_opacity)
+    staying = sorted(set(range(len(labels.kind))) - {cut.row for cut in cuts})
     inputs = BackgroundInputs(
         ground_geometry.horizon_row(ground, camera),
         ground,
         camera,
-        _background_boxes(labels, camera, [cut.row for cut in cuts]) | (ego_opacity > 0),
+        _boxes_of(labels, camera, [row for row in staying if labels.kind[row] not in VEHICLE_CATEGORIES])
+        | (ego_opacity > 0),
+        _boxes_of(labels, camera, [row for row in staying if labels.kind[row] in people.PEOPLE_KINDS]),
         sum(opacities, np.zeros(image.shape[:2], np.float32)),
         maps,
     )
@@ -645,15 +648,12 @@ def _label_box_mask(labels: Labels, row: int, shape: tuple[int, int]) -> Mask:
     return inside
 
 
-def _background_boxes(labels: Labels, camera: Camera, objects: list[int]) -> Mask:
-    """Pixels (H, W) in the boxes of labels that are neither vehicles nor in the rows `objects`: nothing is copied from
-    there.
-    """
+def _boxes_of(labels: Labels, camera: Camera, rows: list[int]) -> Mask:
+    """Pixels (H, W) in the boxes of labels."""
     inside = np.zeros((camera.height, camera.width), bool)
-    for row, (kind, box) in enumerate(zip(labels.kind, labels.boxes_xyxy.tolist(), strict=True)):
-        if kind not in VEHICLE_CATEGORIES and row not in objects:
-            x0, y0, x1, y1 = (max(int(side), 0) for side in box)
-            inside[y0 : y1 + 2, x0 : x1 + 2] = True
+    for box in labels.boxes_xyxy[rows].tolist():
+        x0, y0, x1, y1 = (max(int(side), 0) for side in box)
+        inside[y0 : y1 + 2, x0 : x1 + 2] = True
     return inside
 
 
@@ -718,12 +718,12 @@ def _separate_layers(
         hole |= grow_mask(view.in_frame(region, hole.shape), 2.5) | grow_mask(cut.mask, 4)
         hole[view.window] |= view.distance < 0.2
     reaches = [(i, cut.reach) for i, cut in enumerate(cuts) if cut.reach is not None]
-    for _, reach in reaches:
-        hole |= grow_mask(reach, 2)
-    filled = fill.fill_hole(hole, settings.seed)
+    people = [grow_mask(reach, 2) for _, reach in reaches]
+    filled = fill.fill_hole(hole | _union(people, hole.shape), settings.seed)
+    for place, person in enumerate(people):
+        filled = fill.fill_thin(filled, person, _union(people[place + 1 :], hole.shape))
     mattes = [cutout_opacity(cut.cutout, cut.mask, cut.hidden) for cut in cuts]
     for i, reach in reaches:
-        filled = fill.fill_thin(filled, grow_mask(reach, 2))
         mattes[i] = np.maximum(mattes[i], _TRACE_OPACITY * reach).astype(np.float32)
     opaque = np.max(mattes, axis=0)
     shadow_share = np.zeros(image.shape[:2], np.float32)

@@ -22,6 +22,8 @@ Mask = NDArray[np.bool_]
 
 PEOPLE_CATEGORIES = {"Pedestrian": Category.PEDESTRIAN, "Cyclist": Category.CYCLIST}
 """Label types that may become upright objects."""
+PEOPLE_KINDS = (*PEOPLE_CATEGORIES, "Person_sitting")
+"""Label types of people."""
 _TWO_WHEELERS = ("Bicycle", "Motorcycle")
 _MIN_RIDDEN = 0.3
 """Least share of the smaller box that a rider and the two-wheeler have in common."""
@@ -122,7 +124,7 @@ def cut_out_people(
     posed = set(rows)
     reasons: dict[int, str] = {}
     for row, kind in enumerate(labels.kind):
-        if kind in PEOPLE_CATEGORIES or kind == "Person_sitting":
+        if kind in PEOPLE_KINDS:
             reason = _find_obstacle(labels, row, frame, ridden) if row in posed else "no 3D box"
             reasons[row] = reason
     chosen = [row for row, reason in reasons.items() if not reason]

@@ -7,7 +7,7 @@ with the generator's own pictures of the moved people.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +62,8 @@ METHOD = (
     "old one, after which a person is still found there. Removed: of the same, places where a person is still found "
     "after all of them were taken out. Generated streets: mean absolute difference, in levels of 255, from the "
     "generator's picture of the moved person in that person's true new box; pasted: the old box of the photograph "
-    "copied there, foot to foot; medians. Intervals: Wilson, 95 %."
+    "copied there, foot to foot; removed: from its picture without people, in the old box; medians. Intervals: "
+    "Wilson, 95 %."
 )
 MOVES_M = (0.5, 1.0, 2.0)
 PEOPLE = tuple(CLASSES[int(category)] for category in UPRIGHT)
@@ -105,6 +106,8 @@ class PersonRow:
     """At the old box, after all people were taken out."""
     moves: tuple[PersonMove, ...] = field(default=())
     """The moves that are feasible."""
+    emptied: float | None = None
+    """Levels between our picture without people and the generator's, in the old box; None for photographs."""
 
 
 def measure(config: BenchTool, sheets: Path | None = None) -> Iterator[list[PersonRow]]:
@@ -164,8 +167,10 @@ class PeopleJudge:
         before = self._view.view_cars(scene.photograph, scene.objects.box2d[people])
         emptied = self._view.view_cars(render([remove_objects(scene, people)])[0].image, before.boxes_xyxy)
         removed = assign(before.boxes_xyxy, emptied.named(PEOPLE, self._t_star))
+        empty = self._draw_empty(name, scene, people)
         found = []
         for place, row in enumerate(people):
+            old_xyxy = scene.objects.box2d[row].numpy()
             if before.assigned[place].found and removed[place].found:
                 self._write(name, place, "removed", before, emptied)
             moved = []
@@ -192,6 +197,7 @@ class PeopleJudge:
                     before=before.assigned[place],
                     removed=removed[place],
                     moves=tuple(moved),
+                    emptied=None if empty is None else _levels(emptied.picture, empty, old_xyxy),
                 )
             )
         return found
@@ -208,6 +214,17 @@ class PeopleJudge:
             caption = f"{name} person {place}, {what}: score {before.assigned[place].score:.2f} before"
             file = f"{what}-{name.replace('/', '_')}-{place}.png"
             files.write_png(self._sheets / file, failure_sheet(before, after, place, caption, PEOPLE))
+
+    def _draw_empty(self, name: str, scene: SceneIR, people: list[int]) -> Picture | None:
+        """The generator's picture without people; None for photographs."""
+        if self._plans is None:
+            return None
+        planned = self._plans.find_plan(name, scene)
+        gone = {planned.tracks[row] for row in people}
+        drawn = render_frame(
+            replace(planned.plan, actors=tuple(one for one in planned.plan.actors if one.track not in gone))
+        )
+        return None if drawn is None else drawn.image
 
     def _compare(
         self, name: str, scene: SceneIR, changed: SceneIR, row: int, picture: Picture
@@ -226,10 +243,7 @@ class PeopleJudge:
         if not boxes:
             return ()
         pasted = paste(to_uint8(scene.photograph), scene.objects.box2d[row].numpy(), boxes[0])
-        x0, y0, x1, y1 = _pixels(boxes[0], moved.image.shape)
-        truth = moved.image[y0:y1, x0:x1].astype(np.float64)
-        ours, control = (float(np.abs(p[y0:y1, x0:x1] - truth).mean()) for p in (picture, pasted))
-        return round(ours, 3), round(control, 3)
+        return _levels(picture, moved.image, boxes[0]), _levels(pasted, moved.image, boxes[0])
 
 
 class PeopleMoves:
@@ -276,6 +290,13 @@ def paste(picture: Picture, old_xyxy: NDArray[Any], new_xyxy: NDArray[Any]) -> P
     return pasted
 
 
+def _levels(picture: Picture, truth: Picture, box_xyxy: NDArray[Any]) -> float:
+    """Mean absolute difference of two pictures (H, W, 3) in a box (4,) px, in levels of 255."""
+    x0, y0, x1, y1 = _pixels(box_xyxy, truth.shape)
+    part = slice(y0, y1), slice(x0, x1)
+    return round(float(np.abs(picture[part].astype(np.float64) - truth[part]).mean()), 3)
+
+
 def _pixels(box_xyxy: NDArray[Any], shape: tuple[int, ...]) -> tuple[int, int, int, int]:
     """First and past the last column and row of a box's pixels inside of a picture."""
     x0, y0, x1, y1 = (round(float(value)) for value in box_xyxy)
@@ -305,7 +326,7 @@ def _line(measure: str, found: Sequence[bool], goal: str | None = None) -> dict[
 
 
 def compare_with_generator(rows: Sequence[PersonRow]) -> list[dict[str, Any]]:
-    """A line a move; none for photographs."""
+    """A line a move, and one for removal; none for photographs."""
     lines = []
     for metres in MOVES_M:
         pairs = [
@@ -320,4 +341,7 @@ def compare_with_generator(rows: Sequence[PersonRow]) -> list[dict[str, Any]]:
             lines.append(
                 {"move": f"{metres:g} m", "people": len(pairs), "ours": ours, "pasted": pasted, "nearer": nearer}
             )
+    emptied = [row.emptied for row in rows if row.emptied is not None]
+    if emptied:
+        lines.append({"move": "removed", "people": len(emptied), "ours": round(float(np.median(emptied)), 1)})
     return lines

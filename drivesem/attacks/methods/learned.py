@@ -42,7 +42,7 @@ proposals spread there (Thompson sampling)."""
 _PLAIN = 2
 """Random points of each frame, for the run's rate of misses. More of them in frames in which the search goes on would
 bias it."""
-_RANDOM, _TRANSFERRED = 8, 8
+_RANDOM, _TRANSFERRED = 4, 4
 """Rendered points from which proposals come: random ones, and those transferred from finished frames."""
 _ONLY_RANDOM = 32
 """Their number while there is nothing to transfer."""

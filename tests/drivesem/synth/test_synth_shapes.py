@@ -133,6 +133,20 @@ def test_varied_people_stand_on_the_ground_and_differ_in_shape():
         assert len(shapes) >= least
 
 
+def test_a_pram_is_in_the_middle_before_who_pushes_it_on_the_ground():
+    """The origin is the middle of both, so that their 3D box contains them; head behind, wheels in front."""
+    for seed in range(24):
+        alone, both = (people.pedestrian(np.random.default_rng(seed), True, pram) for pram in (False, True))
+        _check(both)
+        points = both.corners.reshape(-1, 3)
+        assert len(both) > len(alone)
+        assert np.abs(points[:, 0]).max() < people.PRAM_LENGTH_M / 2 + 0.25  # a foot reaches farther back
+        assert np.ptp(points[:, 0]) > 1.3
+        assert -0.08 < points[:, 1].max() < 0.08
+        assert points[points[:, 1] < -1.5][:, 0].mean() < -0.3
+        assert points[points[:, 0] > 0.4][:, 1].max() == pytest.approx(0, abs=0.02)
+
+
 @pytest.mark.parametrize(
     ("figure", "count", "spread"), [(people.pedestrian, 1060, 0.557607), (people.cyclist, 1968, 0.504367)]
 )

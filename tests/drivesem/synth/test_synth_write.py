@@ -15,7 +15,7 @@ from drivesem.run.workers import make_parallel_map
 from drivesem.synth import write
 from drivesem.synth.exposure import CLASS_NAMES, expose
 from drivesem.synth.frames import VARIANTS, SynthSettings, apply_variation, boxes_alone, plan_frame, render_frame
-from drivesem.synth.layout import LayoutSettings
+from drivesem.synth.layout import PUSHES_PRAM, LayoutSettings
 from drivesem.synth.world import actor_soup
 from drivesem.synth.write import Order, list_jobs, plan_job, synthesise
 from scene_ir import files
@@ -302,7 +302,9 @@ def test_varied_people_are_part_of_the_recipe(tmp_path):
         for chosen in (False, True)
     )
     assert {actor.variant for actor in plain} == {0}
-    assert {actor.variant for actor in varied} == {1}
+    assert {actor.variant for actor in varied} == {1, PUSHES_PRAM}
+    lengths = {actor.size_lhw[0] > 1.5 for actor in varied if actor.variant == PUSHES_PRAM}
+    assert lengths == {True}
     assert any(len(actor_soup(one, 0)) != len(actor_soup(replace(one, variant=0), 0)) for one in varied)
     assert min(actor.size_lhw[1] for actor in varied) < 1.45 < min(actor.size_lhw[1] for actor in plain)
     with pytest.raises(RangeError, match="varied_people"):

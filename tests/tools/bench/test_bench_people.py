@@ -131,8 +131,11 @@ def test_the_command_compares_with_the_generator(
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert {row["frame"] for row in result["rows"]} == {"000000"}
     assert all(row["exact"] for row in result["rows"])
-    assert [line["move"] for line in result["generator"]] == ["0.5 m", "1 m", "2 m"]
-    for line in result["generator"]:
+    *moved, removed = result["generator"]
+    assert [line["move"] for line in moved] == ["0.5 m", "1 m", "2 m"]
+    assert removed["move"] == "removed"
+    assert 0 < removed["ours"] < max(line["pasted"] for line in moved)
+    for line in moved:
         assert line["ours"] < line["pasted"]
         assert line["nearer"] > line["people"] / 2
 
