@@ -305,6 +305,21 @@ def test_a_person_leaves_whole_though_the_mask_of_somebody_behind_covers_it(cros
     assert float((changed > 0.02).double().mean()) > 0.9 * float((usual > 0.02).double().mean()) > 0.5
 
 
+def test_what_is_labelled_and_stays_goes_on_behind_a_person(crossing, scene):
+    own = crossing.masks[1].numpy() > 0.5
+    rows, columns = np.flatnonzero(own.any(1)), np.flatnonzero(own.any(0))
+    tram = np.zeros(own.shape, np.float32)
+    tram[: rows[-1] - len(rows) // 5, max(columns[0] - len(rows), 0) : columns[-1] + len(rows)] = 1
+    far = torch.tensor([[PLACE[0], PLACE[1], PLACE[2] + 9]])
+    labels = label_person(crossing.labels, tram > 0, kind="Tram", translation=far)
+    frame = replace(
+        crossing, labels=labels, masks=torch.cat([crossing.masks, torch.from_numpy(tram * ~own)[None]])
+    )
+    found = derender(frame, DerenderSettings(fit=False, people=True))
+    assert found.objects.category.tolist() == [Category.CAR, Category.PEDESTRIAN]
+    assert float((found.background - scene.background).abs()[:, own].mean()) < 0.02
+
+
 def test_people_who_overlap_stay_background(crossing):
     twice = label_person(crossing.labels, crossing.masks[1].numpy() > 0.5)
     masks = torch.cat([crossing.masks, crossing.masks[1:]])
