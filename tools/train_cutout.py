@@ -705,8 +705,8 @@ PEOPLE_CARD = {
   (coats, skirts, hats, bags, prams, children, people side by side, riders of motorcycles) in boxes with sides off as
   drawn by hand, more, and less. Clothes with folds and patterns.""",
     "off": "4% of the box's sides",
-    "limits": """On photographs it is unsure of very bright clothes and of people under 40 px high, and leaves out what
-people push; `scene_ir.derender.people` uses no outline that it is unsure of.""",
+    "limits": """On photographs it is unsure of very bright clothes and of people under 40 px high, and its prams
+are simple ones; `scene_ir.derender.people` uses no unsure outline, and nothing outside the label's box.""",
     "option": "--people --out scene_ir/derender/weights/people.safetensors",
 }
 COLUMNS = (
