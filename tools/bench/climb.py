@@ -108,7 +108,7 @@ def _parts(
             "render_ms": partial(compositor.render, perturbed),
             "picture_ms": partial(draw.degrade_image, image),
             "detector_ms": partial(detector.forward_for_search, picture[None]),
-            "pass_ms": partial(views.margins, theta, i % _DRAWS),
+            "pass_ms": partial(views.margins, [theta], [i % _DRAWS]),
         }
         with torch.no_grad():
             taken = {name: _ms(part) for name, part in parts.items()}

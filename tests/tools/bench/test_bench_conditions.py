@@ -170,7 +170,7 @@ def test_a_run_measures_draws_and_resumes(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pictures that were drawn before are used again; other conditions have no real frames."""
-    monkeypatch.setattr(ConditionSets, "_scene", None)  # de-rendering would fail
+    monkeypatch.setattr(ConditionSets, "scene", None)  # de-rendering would fail
     out = root.parent / "out"
     for name in names_of("B", "day", FRAMES):
         photograph = cv2.imread(str(root / "images" / f"{name}.jpg"))
