@@ -27,7 +27,6 @@ def _one_thread_more_or_less_stays_here() -> Any:
 @pytest.mark.slow
 def test_memory(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "QUICK_STEPS", 20)
-    monkeypatch.setattr(memory, "_BATCHES", ())
     words = ["memory", "--quick", "--cars", "1", "--triangles", "600", "--threads", "1", "--json"]
     assert main(words) == 0
     result = json.loads(capsys.readouterr().out)
@@ -98,8 +97,8 @@ def test_planted_across(
     monkeypatch.setattr(FramePool, "make", pool)
     monkeypatch.setattr(across.SharedFaultBench, "_attempt", attempt)
     monkeypatch.setattr(across, "KINDS", (("height_px",), ("aspect",), ("lightness",)))
-    monkeypatch.setattr(across, "FRAMES", 2)
-    monkeypatch.setattr(across, "CARS", 3)
+    monkeypatch.setattr(across, "FRAMES", {"common": 2})
+    monkeypatch.setattr(across, "CARS", {"common": 3})
     scene = build_bench_scene(1, 600).scene
     monkeypatch.setattr(across.SharedFaultBench, "_scene", lambda *_: scene)
     monkeypatch.setattr(across_names, "CHANCE_DETECTORS", 2)
