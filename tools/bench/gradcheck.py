@@ -193,8 +193,9 @@ class _Path:
         part = self.space.unflatten(theta)
         assert part.weather is not None
         assert part.foliage is not None
-        start = self.scene.environment
-        return scene.with_environment(weather=start.weather + part.weather, foliage=start.foliage + part.foliage)
+        start, count = self.scene.environment, len(part.weather)
+        weather = torch.cat([start.weather[:count] + part.weather, start.weather[count:]])
+        return scene.with_environment(weather=weather, foliage=start.foliage + part.foliage)
 
     def detect(self, picture: Tensor) -> AnchorPredictions:
         """The detector's scores of a picture (3, H, W)."""
