@@ -28,10 +28,12 @@ def test_without_weather_both_are_the_photograph(rows: list[weather.WeatherRow])
 
 @pytest.mark.slow
 def test_fog_is_as_bright_and_as_flat_as_the_generators(rows: list[weather.WeatherRow]) -> None:
-    """Blended in display values it would be a tenth darker, and half as contrasted again."""
+    """Blended in display values it would be a tenth darker again, and half as contrasted again. The generator exposes
+    as a camera does, so it is somewhat brighter than our constants of real frames.
+    """
     plain, fog, _ = rows
     assert min(fog.mean - plain.mean, fog.mean_true - plain.mean_true) > 0.1
-    assert fog.mean == pytest.approx(fog.mean_true, abs=0.06)
+    assert fog.mean == pytest.approx(fog.mean_true, abs=0.1)
     assert fog.contrast == pytest.approx(fog.contrast_true, rel=0.35)
 
 
