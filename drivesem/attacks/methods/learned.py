@@ -34,7 +34,7 @@ MIN_ROWS = 200
 """With fewer rows there is no model."""
 _MAX_ROWS = 20_000
 """Rows of a fit, chosen at random: it takes a second."""
-_LOWEST, _HIGHEST = -4.0, 6.0
+LOWEST_MARGIN, HIGHEST_MARGIN = -4.0, 6.0
 """Range of margins in the fit: how far a car is lost, or how safely it is found, is of no interest."""
 _TREES, _TREES_OF_PROPOSAL = 48, 3
 """Trees; and of how many of them a proposal takes the mean. Others of the 48 differ where little is known, so
@@ -70,7 +70,7 @@ class MarginModel:
         if len(rows) > _MAX_ROWS:
             rows = rows[np.random.default_rng(0).choice(len(rows), _MAX_ROWS, replace=False)]
         trees = ExtraTreesRegressor(_TREES, min_samples_leaf=2, max_features=0.7, random_state=0)
-        self._trees: ExtraTreesRegressor = trees.fit(rows[:, :-1], rows[:, -1].clip(_LOWEST, _HIGHEST))
+        self._trees: ExtraTreesRegressor = trees.fit(rows[:, :-1], rows[:, -1].clip(LOWEST_MARGIN, HIGHEST_MARGIN))
 
     def predict(self, features: Tensor) -> Tensor:
         """Predict with each tree.

@@ -7,11 +7,13 @@ import torch
 
 from detectors.incremental.reference import LIMIT_MB
 from detectors.registry import load_detector
+from drivesem.attacks.labels import hidden_shares
 from drivesem.attacks.objective import Objective
 from drivesem.attacks.space import ParameterSpace
 from drivesem.config.commands import AttackConfig
 from drivesem.failures.margin_oracle import NuisanceMarginOracle
 from drivesem.failures.nuisances import Nuisances
+from drivesem.failures.search_log import OBJECT_FEATURES
 from drivesem.synth.demo import demo_scene
 from scene_ir.render.compositor import Compositor
 
@@ -63,6 +65,24 @@ def test_a_number_is_one_draw(views: NuisanceMarginOracle, objective: Objective)
     # What was kept of a draw changes nothing.
     anew = NuisanceMarginOracle.for_objective(objective, Nuisances(), "search:demo-000:0")
     assert torch.equal(anew.margins([objective.space.theta0], [3])[0], one)
+
+
+def test_objects_are_described_as_their_margins_are_recorded(
+    views: NuisanceMarginOracle, objective: Objective
+) -> None:
+    theta = 0.5 * (objective.space.theta0 + objective.space.upper)
+    (margins,) = views.margins([theta], [3])
+    recorded = objective.search_log.margin_rows()
+    before = views.passes
+    rows, features, cells = views.describe(theta, 3)
+    assert views.passes == before
+    assert rows.tolist() == torch.isfinite(margins).nonzero()[:, 0].tolist()
+    assert len(cells) == len(rows) > 0
+    assert recorded[-len(rows) :, :-1] == pytest.approx(features.float().numpy(), abs=1e-6)
+    shares = features[:, OBJECT_FEATURES.index("occlusion")]
+    scene = views.sample(3).perturb_scene(objective.space.apply(objective.space.scene, theta))
+    assert shares.tolist() == pytest.approx(hidden_shares(objective.compositor.render(scene))[rows].tolist())
+    assert float(shares.max()) > 0.1
 
 
 def random_states(objective: Objective) -> int:
