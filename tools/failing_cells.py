@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import (
     Interval,
     NamedMetric,
@@ -25,6 +26,7 @@ from drivesem.evaluation.resampling import (
 from drivesem.run.finished import load_runs
 from drivesem.run.frame import build_map, certain_losses
 from drivesem.run.results import FrameResult
+from scene_ir.errors import FormatError
 
 _COLUMNS = (
     "run", "frames", "found before", "certain", "failing cells", "passes", "cells for 1,000 passes",
@@ -81,11 +83,15 @@ def _format(rate: Interval) -> str:
     return f"{rate.value:.1f} [{rate.low:.1f}, {rate.high:.1f}]"
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", help="folders of runs on the same frames")
-    for row in (_COLUMNS, ("---",) * len(_COLUMNS), *compare(parser.parse_args().runs)):
+    try:
+        rows = compare(parser.parse_args(arguments).runs)
+    except (UsageError, FormatError) as error:
+        parser.exit(2, f"{error}\n")
+    for row in (_COLUMNS, ("---",) * len(_COLUMNS), *rows):
         print(f"| {' | '.join(row)} |")
 
 

@@ -18,8 +18,10 @@ import numpy as np
 import torch
 
 from drivesem.attacks.methods.learned import HIGHEST_MARGIN, LOWEST_MARGIN, MarginModel
+from drivesem.config.errors import UsageError
 from drivesem.failures.search_log import OBJECT_FEATURES
 from drivesem.run.search_memory import MARGINS, Experience
+from scene_ir.errors import FormatError
 
 _PARTS = 5
 _COLUMNS = ("features", "frames", "rows", "missed", "explained", "AUC", "inside")
@@ -53,13 +55,11 @@ def judge_model(rows: np.ndarray, frames: np.ndarray) -> tuple[float, float, flo
 
 
 def compare_features(folder: Path) -> list[tuple[str, ...]]:
-    """Rows of the table. Raises FormatError for a damaged file."""
+    """Rows of the table. Raises UsageError for too few frames, FormatError for a damaged file."""
     paths = sorted(folder.glob(f"frames/*/{MARGINS}"))
     by_frame = [Experience.read(path).rows for path in paths]
     if len(paths) < _PARTS:
-        raise SystemExit(
-            f"{folder}: at least {_PARTS} frames with {MARGINS} (drivesem attack --method learn), not {len(paths)}"
-        )
+        raise UsageError("run", f"{_PARTS} frames with {MARGINS} or more", f"{len(paths)} in {folder}")
     rows = np.concatenate(by_frame)
     frames = np.repeat(np.arange(len(by_frame)), [len(part) for part in by_frame])
     counts = (str(len(paths)), str(len(rows)), str(int((rows[:, -1] < 0).sum())))
@@ -75,7 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a run with --method learn")
-    for row in (_COLUMNS, ("---",) * len(_COLUMNS), *compare_features(parser.parse_args(arguments).run)):
+    try:
+        rows = compare_features(parser.parse_args(arguments).run)
+    except (UsageError, FormatError) as error:
+        parser.exit(2, f"{error}\n")
+    for row in (_COLUMNS, ("---",) * len(_COLUMNS), *rows):
         print(f"| {' | '.join(row)} |")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 
 from drivesem.failures.feature_cells import Cell, CellVisit
 from tools import failing_cells
-from tools.failing_cells import compare, find_failing_cells
+from tools.failing_cells import compare, find_failing_cells, main
 
 DARK, BRIGHT = (0, 0, 0, 0), (0, 0, 0, 1)
 
@@ -57,3 +58,10 @@ def test_runs_are_compared_on_the_frames_that_all_have(monkeypatch: pytest.Monke
     assert first[6].startswith("100.0 [")
     assert first[-1] == ""
     assert second[-1].startswith("90.0 [")
+
+
+def test_a_folder_that_is_no_run_ends_with_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([str(tmp_path)])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1

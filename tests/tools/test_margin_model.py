@@ -50,6 +50,8 @@ def test_a_feature_that_is_left_out_is_missed(tmp_path: Path, capsys: pytest.Cap
     assert "| all | 10 | 300 |" in capsys.readouterr().out
 
 
-def test_a_run_of_few_frames(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"at least 5 frames with margins\.npz"):
-        compare_features(write_run(tmp_path, 4))
+def test_a_run_of_few_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([str(write_run(tmp_path, 4))])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == f"run: expected 5 frames with margins.npz or more, found 4 in {tmp_path}\n"
