@@ -72,8 +72,6 @@ class SceneLabels:
     """(N,), share outside of the picture, in [0, 1]."""
     occlusion: Tensor
     """(N,) int64, KITTI's level, 0 to 3."""
-    hidden: Tensor
-    """(N,) float64, share of its pixels that other objects hide; 0 without a render."""
     ignore: Tensor
     """(N,) bool, too hard in the benign scene or now."""
     became_ignored: Tensor
@@ -134,9 +132,6 @@ class Labeller:
             category=objects.category.cpu(),
             truncation=torch.from_numpy(self._truncation),
             occlusion=torch.from_numpy(self._occlusion),
-            hidden=torch.zeros(len(objects), dtype=torch.float64)
-            if self._hidden is None
-            else torch.from_numpy(self._hidden),
             ignore=ignore,
             became_ignored=torch.zeros_like(ignore),
             became_counted=torch.zeros_like(ignore),
@@ -166,7 +161,7 @@ class Labeller:
         truncation = np.minimum(np.maximum(self._truncation + change, 0), 1)
         truncation = np.where(change == 0, self._truncation, truncation)
         occlusion, gone = self._occlusion, np.zeros_like(self._ignore)
-        out_of_sight, hidden = gone, self._paper.hidden.numpy()
+        out_of_sight = gone
         if self._hidden is not None and render is not None:
             hidden = hidden_shares(render)
             occlusion = _new_occlusion(self._occlusion, np.where(self._absent, 0.0, self._hidden), hidden)
@@ -179,7 +174,6 @@ class Labeller:
             category=self._paper.category if category is self.base.objects.category else category.cpu(),
             truncation=torch.from_numpy(truncation),
             occlusion=torch.from_numpy(occlusion),
-            hidden=torch.from_numpy(hidden),
             ignore=torch.from_numpy(self._ignore | hard),
             became_ignored=torch.from_numpy(hard & ~self._ignore),
             became_counted=torch.from_numpy(self._ignore & ~hard),

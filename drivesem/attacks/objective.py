@@ -129,9 +129,8 @@ class Objective:
         """What was evaluated so far, the benign picture first."""
         rows = torch.tensor(self.judged, dtype=torch.int64)
         missed = ~torch.isin(rows, torch.tensor(self.found_before, dtype=torch.int64))
-        labels = self.benign.paper
         self.search_log.record(
-            self.benign.render.image, rows, labels.boxes_xyxy[rows], labels.hidden[rows], missed, self.passes
+            self.benign.render.image, rows, self.benign.paper.boxes_xyxy[rows], missed, self.passes
         )
         self._scores_random_states = config.samples_states
         self._recent: deque[tuple[Tensor, RenderEvaluation]] = deque(maxlen=_RECENT)
@@ -284,9 +283,8 @@ class Objective:
         rows = torch.tensor(self.found_before, dtype=torch.int64)
         rows = rows[~moved.ignore[rows]]
         missed = torch.isin(rows, torch.tensor(failed.lost, dtype=torch.int64))
-        boxes_xyxy, hidden_shares = moved.boxes_xyxy[rows], moved.hidden[rows]
-        random = self._scores_random_states and passes > 0
-        self.search_log.record(image.detach(), rows, boxes_xyxy, hidden_shares, missed, passes, random=random)
+        boxes_xyxy, random = moved.boxes_xyxy[rows], self._scores_random_states and passes > 0
+        self.search_log.record(image.detach(), rows, boxes_xyxy, missed, passes, random=random)
         # The projection treats vehicles as boxes, which may hide others from the start; a render is exact.
         hidden = moved.out_of_sight.nonzero()[:, 0].tolist()
         return Score(
@@ -300,9 +298,8 @@ class Objective:
 
     def cell_visits(self, counterexample: RenderEvaluation) -> tuple[CellVisit, ...]:
         """Visits of the benign picture and of the search, which ended at a counterexample."""
-        before, after = self.benign.paper, counterexample.moved
-        start = ObjectPatches.from_image(self.benign.render.image, before.boxes_xyxy, before.hidden)
-        end = ObjectPatches.from_image(counterexample.render.image, after.boxes_xyxy, after.hidden)
+        start = ObjectPatches.from_image(self.benign.render.image, self.benign.paper.boxes_xyxy)
+        end = ObjectPatches.from_image(counterexample.render.image, counterexample.moved.boxes_xyxy)
         return self.search_log.visits(start.cells(), end.cells())
 
     def feasible_set(self, limits: FeasibilityLimits | None = None, only_bounds: bool = False) -> FeasibleSet:

@@ -135,9 +135,9 @@ class NuisanceMarginOracle:
         """
         scene, sample = self._perturb_scene(theta, number), self.sample(number)
         render = self.objective.compositor.render(scene)
-        targets, rows, hidden = self._counted_targets(scene, render)
+        targets, rows = self._counted_targets(scene, render)
         boxes_xyxy = sample.transform_boxes(targets.boxes_xyxy[rows])
-        features = ObjectPatches.from_image(sample.degrade_image(render.image), boxes_xyxy, hidden).features()
+        features = ObjectPatches.from_image(sample.degrade_image(render.image), boxes_xyxy).features()
         return rows, features, cells_of_features(features)
 
     def clear_cache(self) -> None:
@@ -196,12 +196,10 @@ class NuisanceMarginOracle:
         random: bool,
     ) -> Tensor:
         """Margins (N,) from the candidates in a sample's image, which enter the search log."""
-        rows, boxes_xyxy, hidden, margins = self._object_margins(candidates, sample, scene, render, sharpness)
+        rows, boxes_xyxy, margins = self._object_margins(candidates, sample, scene, render, sharpness)
         passes = 1 if sharpness is None else GRADIENT_PASSES
         values = margins.detach()
-        self.objective.search_log.record(
-            image.detach(), rows, boxes_xyxy, hidden, values < 0, passes, values, random
-        )
+        self.objective.search_log.record(image.detach(), rows, boxes_xyxy, values < 0, passes, values, random)
         everywhere = margins.new_full((len(self.counted_objects),), torch.inf)
         return everywhere.index_put((rows.to(margins.device),), margins)
 
@@ -243,29 +241,23 @@ class NuisanceMarginOracle:
         scene: SceneIR,
         render: Render,
         sharpness: float | None,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Rows (K,), boxes (K, 4) px, shares (K,) hidden by others, and margins (K,) of the objects that count here
-        and in the benign image.
-        """
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows (K,), boxes (K, 4) px and margins (K,) of the objects that count here and in the benign image."""
         with torch.no_grad():
             detached = replace(render, image=render.image.detach())
-            targets, rows, hidden = self._counted_targets(scene, detached)
+            targets, rows = self._counted_targets(scene, detached)
             boxes_xyxy, visible = sample.transform_boxes(targets.boxes_xyxy[rows]), visible_boxes(detached)[rows]
             is_visible = (visible[:, 2:] > visible[:, :2]).all(1, keepdim=True)
             visible = torch.where(is_visible, sample.transform_boxes(visible), visible)
         labels = targets.labels[rows]
         margins = margin.object_margins(candidates, boxes_xyxy, labels, visible, self.objective.t_star, sharpness)
-        return rows, boxes_xyxy, hidden, margins
+        return rows, boxes_xyxy, margins
 
-    def _counted_targets(self, scene: SceneIR, render: Render) -> tuple[Targets, Tensor, Tensor]:
-        """Labels of a state, the rows (K,) of the objects that count in it and in the benign image, and the shares (K,)
-        of these objects that others hide.
-        """
+    def _counted_targets(self, scene: SceneIR, render: Render) -> tuple[Targets, Tensor]:
+        """Labels of a state, and the rows (K,) of the objects that count in it and in the benign image."""
         classes, count = self.objective.classes, len(self.counted_objects)
-        labels = self.objective.labeller.moved(scene, render)
-        targets = classes.map_targets(labels.targets)
+        targets = classes.map_targets(self.objective.labeller.moved(scene, render).targets)
         if self.differentiable:
             targets = classes.to_detector_targets(targets)
         counts = self.counted_objects & ~targets.ignore[:count].to(self.counted_objects.device)
-        rows = counts.nonzero()[:, 0]
-        return targets, rows, labels.hidden[rows.cpu()]
+        return targets, counts.nonzero()[:, 0]

@@ -14,9 +14,8 @@ from detectors import boxes
 from detectors.planted import compute_features
 from drivesem.failures.feature_cells import CELL_EDGES, Cell, CellVisit
 
-OBJECT_FEATURES: tuple[str, ...] = ("height_px", "aspect", "across", "occlusion", "lightness", "contrast", "light")
-"""Features of an object as drawn: those of `detectors.planted.FEATURES`, the share of it that others hide, and the mean
-of the picture."""
+OBJECT_FEATURES: tuple[str, ...] = ("height_px", "aspect", "across", "lightness", "contrast", "light")
+"""Features of an object as drawn: those of `detectors.planted.FEATURES`, and the mean of the picture."""
 _GRID = 16
 """Lightness and contrast are those of so many pixels either way in a box, which takes the same time for near and far
 cars."""
@@ -28,8 +27,8 @@ _LIGHT_STEP = 4
 class ObjectPatches:
     """What features need of the objects in one picture. Pixels stay on its device: every transfer would wait for it."""
 
-    label_features: Tensor
-    """(K, 4): height in px, width by height, place across in [0, 1], and share hidden by others."""
+    box_features: Tensor
+    """(K, 3): height in px, width by height, and place across in [0, 1]."""
     pixels: Tensor
     """(K, 3, G, G) RGB, a grid of pixels of each box."""
     light: Tensor
@@ -37,8 +36,8 @@ class ObjectPatches:
 
     @classmethod
     @torch.no_grad()
-    def from_image(cls, image: Tensor, boxes_xyxy: Tensor, hidden: Tensor) -> ObjectPatches:
-        """Sample the boxes (K, 4) px of an image (3, H, W); others hide shares (K,) of the objects."""
+    def from_image(cls, image: Tensor, boxes_xyxy: Tensor) -> ObjectPatches:
+        """Sample the boxes (K, 4) px of an image (3, H, W)."""
         height, width = image.shape[1:]
         left, top, right, bottom = boxes.clip(boxes_xyxy.cpu(), height, width).unbind(1)
         steps = torch.linspace(0, 1, _GRID)
@@ -48,17 +47,14 @@ class ObjectPatches:
         source = image[None].expand(len(grid), -1, -1, -1)
         pixels = F.grid_sample(source, grid.to(image), mode="nearest", padding_mode="border", align_corners=True)
         tall = bottom - top
-        across, shares = (left + right) / (2 * width), hidden.to(tall)
-        label_features = torch.stack([tall, (right - left) / tall.clamp_min(1), across, shares], 1)
-        return cls(label_features, pixels, image[:, ::_LIGHT_STEP, ::_LIGHT_STEP].mean().expand(len(grid)))
+        box_features = torch.stack([tall, (right - left) / tall.clamp_min(1), (left + right) / (2 * width)], 1)
+        return cls(box_features, pixels, image[:, ::_LIGHT_STEP, ::_LIGHT_STEP].mean().expand(len(grid)))
 
     def features(self) -> Tensor:
         """(K, F) float64 on the CPU, in the order of `OBJECT_FEATURES`."""
         whole = torch.tensor([0.0, 0, _GRID - 1, _GRID - 1]).expand(len(self.pixels), 1, 4)
         of_pixels = compute_features(self.pixels.cpu(), whole, ("lightness", "contrast"))[..., 0]
-        return torch.cat(
-            [self.label_features.double(), of_pixels.double().T, self.light.cpu().double()[:, None]], 1
-        )
+        return torch.cat([self.box_features.double(), of_pixels.double().T, self.light.cpu().double()[:, None]], 1)
 
     def cells(self) -> list[Cell]:
         """The cells of the K objects."""
@@ -74,7 +70,7 @@ def cells_of_features(features: Tensor) -> list[Cell]:
 
 def _join(patches: Sequence[ObjectPatches]) -> ObjectPatches:
     return ObjectPatches(
-        torch.cat([p.label_features for p in patches]),
+        torch.cat([p.box_features for p in patches]),
         torch.cat([p.pixels for p in patches]),
         torch.cat([p.light for p in patches]),
     )
@@ -109,7 +105,6 @@ class SearchLog:
         image: Tensor,
         objects: Tensor,
         boxes_xyxy: Tensor,
-        hidden: Tensor,
         missed: Tensor,
         passes: int,
         margins: Tensor | None = None,
@@ -121,14 +116,13 @@ class SearchLog:
             image: (3, H, W) RGB in [0, 1], what the detector sees.
             objects: (K,) int64, numbers of the objects that count in it.
             boxes_xyxy: (K, 4) px, their labels.
-            hidden: (K,), shares of their pixels that others hide.
             missed: (K,) bool.
             passes: Detector passes that the state took.
             margins: (K,) logits, where they are known.
             random: Whether no score influenced the state.
         """
         if len(objects):
-            patches = ObjectPatches.from_image(image, boxes_xyxy, hidden)
+            patches = ObjectPatches.from_image(image, boxes_xyxy)
             self._states.append(_State(objects, patches, missed, passes, margins, random))
 
     def margin_rows(self) -> np.ndarray:

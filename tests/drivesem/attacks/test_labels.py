@@ -138,8 +138,6 @@ def test_occlusion_follows_the_visible_share(street):
     labeller = Labeller(scene, _two_cars(scene, 0))
     levels = {h: int(labeller.moved(scene, _two_cars(scene, h)).occlusion[1]) for h in (0, 1, 5, 10, 15)}
     assert levels == {0: 0, 1: 0, 5: 1, 10: 2, 15: 2}
-    assert labeller.moved(scene, _two_cars(scene, 5)).hidden.tolist() == pytest.approx([0.0, 0.25])
-    assert labeller.paper().hidden.tolist() == [0, 0]
     moved = labeller.moved(scene, _two_cars(scene, 15))
     assert moved.became_ignored.tolist() == [False, True]
     assert moved.ignore.tolist() == [False, True]
