@@ -15,7 +15,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivesem.config.errors import UsageError
 from drivesem.evaluation.resampling import (
     Interval,
     NamedMetric,
@@ -26,7 +25,7 @@ from drivesem.evaluation.resampling import (
 from drivesem.run.finished import load_runs
 from drivesem.run.frame import build_map, certain_losses
 from drivesem.run.results import FrameResult
-from scene_ir.errors import FormatError
+from tools.run_table import print_table
 
 _COLUMNS = (
     "run", "frames", "found before", "certain", "failing cells", "passes", "cells for 1,000 passes",
@@ -87,12 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", help="folders of runs on the same frames")
-    try:
-        rows = compare(parser.parse_args(arguments).runs)
-    except (UsageError, FormatError) as error:
-        parser.exit(2, f"{error}\n")
-    for row in (_COLUMNS, ("---",) * len(_COLUMNS), *rows):
-        print(f"| {' | '.join(row)} |")
+    runs = parser.parse_args(arguments).runs
+    print_table(parser, "Failing cells", _COLUMNS, lambda: compare(runs))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from drivesem.attacks.methods.learned import HIGHEST_MARGIN, LOWEST_MARGIN, Marg
 from drivesem.config.errors import UsageError
 from drivesem.failures.search_log import OBJECT_FEATURES
 from drivesem.run.search_memory import MARGINS, Experience
-from scene_ir.errors import FormatError
+from tools.run_table import print_table
 
 _PARTS = 5
 _COLUMNS = ("features", "frames", "rows", "missed", "explained", "AUC", "inside")
@@ -75,12 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a run with --method learn")
-    try:
-        rows = compare_features(parser.parse_args(arguments).run)
-    except (UsageError, FormatError) as error:
-        parser.exit(2, f"{error}\n")
-    for row in (_COLUMNS, ("---",) * len(_COLUMNS), *rows):
-        print(f"| {' | '.join(row)} |")
+    run = parser.parse_args(arguments).run
+    print_table(parser, "Predicted margins", _COLUMNS, lambda: compare_features(run))
 
 
 if __name__ == "__main__":

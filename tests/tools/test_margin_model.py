@@ -11,7 +11,6 @@ from drivesem.failures.search_log import OBJECT_FEATURES
 from drivesem.run.search_memory import MARGINS, Experience
 from tools.margin_model import compare_features, judge_model, main
 
-pytest.importorskip("sklearn")
 FRAMES, OBJECTS = 10, 30
 
 
